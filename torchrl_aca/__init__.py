@@ -1,0 +1,19 @@
+"""Actor-Critic without Actor (ACA) as composable TorchRL modules."""
+
+from importlib.metadata import version
+
+from torchrl_aca.actor import CriticGuidedDenoisingActor
+from torchrl_aca.critic import NoiseLevelCritic, NoiseLevelCriticBase
+from torchrl_aca.custom_critic import CustomCritic
+from torchrl_aca.loss import ACALoss
+from torchrl_aca.schedule import NoiseSchedule
+
+__all__ = [
+    "ACALoss",
+    "CriticGuidedDenoisingActor",
+    "CustomCritic",
+    "NoiseLevelCritic",
+    "NoiseLevelCriticBase",
+    "NoiseSchedule",
+]
+__version__ = version("torchrl-aca")

@@ -1,0 +1,272 @@
+"""The actor that is no network: critic-guided denoising from Gaussian noise to an action."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
+from torchrl.envs.utils import ExplorationType, exploration_type
+
+from torchrl_aca import functional as F
+from torchrl_aca.critic import NoiseLevelCriticBase
+from torchrl_aca.custom_critic import as_noise_level_critic
+from torchrl_aca.schedule import NoiseSchedule
+
+__all__ = ["CriticGuidedDenoisingActor"]
+
+
+class CriticGuidedDenoisingActor(TensorDictModuleBase):
+    """Samples actions by denoising Gaussian noise along the critic's gradient (Definition 1).
+
+    For each state, ``num_candidates`` chains run from ``a_T ~ N(0, I)`` to ``a_0``; the candidate
+    with the largest minimum over the critics at level 0 is kept, and Gaussian exploration noise of
+    standard deviation ``exploration_noise * alpha`` is added.
+
+    Under the exploration types RANDOM and None the draws are fresh and the exploration noise is
+    added. Under DETERMINISTIC, MODE, MEAN and MEDIAN the exploration noise is dropped and the chain
+    uses one fixed set of draws, the same for every state: the action is then a function of the
+    observation and the weights alone. Best of N stays.
+
+    Data holds actions in the env's units, the critic sees [-1, 1]; :meth:`to_env` and
+    :meth:`from_env` map between the two by the bounds of ``spec``.
+
+    Args:
+        critic: a :class:`NoiseLevelCritic`, or a network of one's own (see :class:`CustomCritic`).
+            ``actor.critic`` holds the very parameters that the loss trains.
+        schedule: the diffusion's constants; its ``T`` is the length of the chain.
+
+    Keyword Args:
+        spec: bounded action spec of one env (``env.action_spec_unbatched``), or a ``Composite`` that
+            holds it under the action's key. Default: actions are in [-1, 1].
+        action_dim: size ``A`` of the action, needed only without ``spec`` for a critic without an
+            ``action_dim`` of its own.
+        guidance_weight: ``w``. Default: 50.
+        num_candidates: ``N``. Default: 32.
+        normalize_gradient: guide by the unit gradient. Default: True.
+        clip_denoised: clip the clean estimate to [-1, 1] in every step. Default: True.
+        exploration_noise: standard deviation of the exploration noise at ``alpha = 1``, in critic
+            units. Default: 0.1.
+        alpha_init: initial ``alpha``. Default: 5.
+        clip_action: clip the action to the spec's bounds. Default: False; as in the official code,
+            exploration noise may leave the box, and the loss learns from such actions.
+        in_keys: keys of the observations. Default: those of the critic.
+        out_keys: the action's key.
+
+    Raises:
+        ValueError: if a number is out of range, the spec is not a bounded vector, or the critic and
+            the schedule differ in ``num_steps``.
+
+    Examples:
+        >>> critic = NoiseLevelCritic(17, 6)
+        >>> actor = CriticGuidedDenoisingActor(critic, NoiseSchedule.cosine(20), num_candidates=4)
+        >>> actor(TensorDict(observation=torch.zeros(3, 17), batch_size=[3]))["action"].shape
+        torch.Size([3, 6])
+    """
+
+    center: Tensor
+    half_range: Tensor
+    fixed_noise: Tensor
+
+    def __init__(
+        self,
+        critic: nn.Module,
+        schedule: NoiseSchedule,
+        *,
+        spec: TensorSpec | None = None,
+        action_dim: int | None = None,
+        guidance_weight: float = 50.0,
+        num_candidates: int = 32,
+        normalize_gradient: bool = True,
+        clip_denoised: bool = True,
+        exploration_noise: float = 0.1,
+        alpha_init: float = 5.0,
+        clip_action: bool = False,
+        in_keys: Sequence[NestedKey] | None = None,
+        out_keys: Sequence[NestedKey] = ("action",),
+    ) -> None:
+        super().__init__()
+        if num_candidates < 1 or guidance_weight < 0 or exploration_noise < 0 or alpha_init <= 0:
+            raise ValueError(
+                "Expected num_candidates >= 1, guidance_weight >= 0, exploration_noise >= 0 and "
+                f"alpha_init > 0; got num_candidates={num_candidates}, guidance_weight="
+                f"{guidance_weight}, exploration_noise={exploration_noise}, alpha_init={alpha_init}."
+            )
+        self.critic: NoiseLevelCriticBase = as_noise_level_critic(critic)
+        if getattr(critic, "num_steps", schedule.num_steps) != schedule.num_steps:
+            raise ValueError(
+                f"The critic has num_steps={critic.num_steps} noise levels, the schedule "
+                f"{schedule.num_steps}. Build both with the same number."
+            )
+        self.schedule = schedule
+        self.guidance_weight = guidance_weight
+        self.num_candidates = num_candidates
+        self.normalize_gradient = normalize_gradient
+        self.clip_denoised = clip_denoised
+        self.exploration_noise = exploration_noise
+        self.clip_action = clip_action
+        self.in_keys = list(in_keys) if in_keys is not None else list(self.critic.observation_keys)
+        self.out_keys = list(out_keys)
+
+        anchor = next(self.critic.parameters())
+        self.log_alpha = nn.Parameter(anchor.new_tensor(math.log(alpha_init)))
+        leaf = _action_spec(spec, self.out_keys[0], action_dim or getattr(critic, "action_dim", None))
+        self.spec = Composite({self.out_keys[0]: leaf}).to(anchor.device)
+        self.action_dim = leaf.shape[-1]
+        low, high = torch.full(leaf.shape, -1.0), torch.full(leaf.shape, 1.0)
+        if spec is not None:
+            low, high = leaf.space.low, leaf.space.high
+        self.register_buffer("center", ((high + low) / 2).to(anchor), persistent=False)
+        self.register_buffer("half_range", ((high - low) / 2).to(anchor), persistent=False)
+        draws = torch.randn(
+            schedule.num_steps + 1, num_candidates, self.action_dim,
+            generator=torch.Generator().manual_seed(0),
+        )  # fmt: skip
+        self.register_buffer("fixed_noise", draws.to(anchor), persistent=False)
+
+    # --- units ------------------------------------------------------------------------------------
+
+    def to_env(self, action: Tensor) -> Tensor:
+        """Critic units, [-1, 1], to the env's units."""
+        return self.center + self.half_range * action
+
+    def from_env(self, action: Tensor) -> Tensor:
+        """The env's units to critic units, [-1, 1]."""
+        return (action - self.center) / self.half_range
+
+    # --- the chain --------------------------------------------------------------------------------
+
+    def denoise(self, observation: Tensor | Sequence[Tensor], noise: Tensor) -> Tensor:
+        """Run all chains on given draws: the deterministic core of the actor.
+
+        Args:
+            observation: the observation of shape ``(*batch, O)``, or one tensor for each of
+                ``in_keys``.
+            noise: standard normal draws of shape ``(T + 1, N, *batch, A)``: row 0 is ``a_T``, row
+                ``k`` belongs to the ``k``-th step; the last row is multiplied by zero.
+
+        Returns:
+            All candidates in critic units, shape ``(N, *batch, A)``.
+        """
+        batch = noise.shape[2:-1]
+        features = self._encode(observation, batch)
+        return self._denoise(features, noise.flatten(2, -2) if batch else noise.unsqueeze(2)).reshape(
+            noise.shape[1:]
+        )
+
+    def select(self, observation: Tensor | Sequence[Tensor], candidates: Tensor) -> Tensor:
+        """The best candidate by the minimum over the critics at level 0.
+
+        Args:
+            observation: as in :meth:`denoise`.
+            candidates: actions in critic units, shape ``(N, *batch, A)``.
+
+        Returns:
+            Actions in critic units, shape ``(*batch, A)``.
+        """
+        batch = candidates.shape[1:-1]
+        rows = candidates.reshape(candidates.shape[0], -1, candidates.shape[-1])
+        return self._select(self._encode(observation, batch), rows).reshape(candidates.shape[1:])
+
+    def _encode(self, observation: Tensor | Sequence[Tensor], batch: torch.Size) -> Any:
+        observations = (observation,) if isinstance(observation, Tensor) else observation
+        rows = [o.reshape(batch.numel(), *o.shape[len(batch) :]) for o in observations]
+        return self.critic.encode(*rows)
+
+    def _denoise(self, features: Any, noise: Tensor) -> Tensor:
+        action, num_steps = noise[0], self.schedule.num_steps
+        indices = torch.arange(num_steps, device=action.device) + self.critic.first_level
+        for level in range(num_steps, 0, -1):
+            gradient = self.critic.action_gradient(features, action, indices[level - 1])
+            if self.normalize_gradient:
+                gradient = F.normalize_gradient(gradient)
+            sigma = self.schedule.sigma(level).to(action.dtype)
+            predicted_noise = F.guided_noise(gradient, self.guidance_weight, sigma)
+            step_noise = noise[num_steps + 1 - level]
+            action = self.schedule.denoise_step(
+                action, predicted_noise, step_noise, level, clip=self.clip_denoised
+            )
+        return action
+
+    def _select(self, features: Any, candidates: Tensor) -> Tensor:
+        clean = torch.zeros((), dtype=torch.long, device=candidates.device)
+        return F.select_best(candidates, self.critic.evaluate(features, candidates, clean))
+
+    # --- acting -----------------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def sample(
+        self,
+        observation: Tensor | Sequence[Tensor],
+        batch: Sequence[int],
+        *,
+        num_candidates: int | None = None,
+        deterministic: bool = False,
+    ) -> Tensor:
+        """Actions in env units for observations of batch shape ``batch``, shape ``(*batch, A)``.
+
+        Args:
+            observation: as in :meth:`denoise`.
+            batch: the batch shape.
+            num_candidates: ``N`` of this call. Default: the actor's.
+            deterministic: fixed draws and no exploration noise.
+
+        Raises:
+            ValueError: if ``num_candidates`` exceeds the actor's in a deterministic call.
+        """
+        batch = torch.Size(batch)
+        num_rows, num_chains = batch.numel(), num_candidates or self.num_candidates
+        features = self._encode(observation, batch)
+        draws = self._draws(num_chains, num_rows, deterministic)
+        action = self._select(features, self._denoise(features, draws[:-1]))
+        if not deterministic:
+            action = action + self.exploration_noise * self.log_alpha.exp() * draws[-1, 0]
+        if self.clip_action:
+            action = action.clamp(-1, 1)
+        return self.to_env(action).reshape(*batch, self.action_dim)
+
+    def _draws(self, num_chains: int, num_rows: int, deterministic: bool) -> Tensor:
+        """All draws of a call, ``(T + 2, N, rows, A)``: chain noise, then exploration noise."""
+        num_steps = self.schedule.num_steps
+        if not deterministic:
+            shape = (num_steps + 2, num_chains, num_rows, self.action_dim)
+            return torch.randn(shape, dtype=self.center.dtype, device=self.center.device)
+        if num_chains > self.fixed_noise.shape[1]:
+            raise ValueError(
+                f"A deterministic call has draws for {self.fixed_noise.shape[1]} candidates, got "
+                f"num_candidates={num_chains}. Build the actor with that many."
+            )
+        draws = self.fixed_noise[:, :num_chains, None].expand(-1, -1, num_rows, -1)
+        return torch.cat([draws, torch.zeros_like(draws[:1])])
+
+    @dispatch(auto_batch_size=False)
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action for observations of any batch shape, ``()`` included."""
+        observation = [tensordict.get(key) for key in self.in_keys]
+        batch = self.critic.batch_shape(observation, tensordict.batch_size)
+        deterministic = exploration_type() not in (None, ExplorationType.RANDOM)
+        action = self.sample(observation, batch, deterministic=deterministic)
+        return tensordict.set(self.out_keys[0], action)
+
+
+def _action_spec(spec: TensorSpec | None, key: NestedKey, action_dim: int | None) -> TensorSpec:
+    """The bounded vector spec of one env's action; an unbounded one where no spec was given."""
+    if spec is None:
+        if action_dim is None:
+            raise ValueError("Pass spec= or action_dim=: the critic does not tell its action_dim.")
+        return Unbounded(shape=(action_dim,))
+    leaf = spec[key] if isinstance(spec, Composite) else spec
+    if not isinstance(leaf, Bounded) or leaf.ndim != 1 or not leaf.dtype.is_floating_point:
+        raise ValueError(
+            "spec must be a bounded, continuous action spec of shape (A,), such as "
+            f"env.action_spec_unbatched; got {leaf}."
+        )
+    if not torch.isfinite(leaf.space.low + leaf.space.high).all():
+        raise ValueError(f"The bounds of the action spec must be finite, got {leaf.space}.")
+    return leaf

@@ -1,0 +1,118 @@
+"""A user's own network as a noise-level critic."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+
+from torchrl_aca.critic import NoiseLevelCriticBase
+
+__all__ = ["CustomCritic", "as_noise_level_critic"]
+
+
+class CustomCritic(NoiseLevelCriticBase):
+    """Any module that maps observations, action and noise level to ``E`` values, as a critic.
+
+    Where the module is a ``TensorDictSequential``, the parts that depend neither on the action nor on
+    the noise level (an image encoder, say) run once per state; the others run once per candidate and
+    denoising step. A plain ``nn.Module`` is called as ``module(observation, action, noise_level)``.
+
+    The module sees flat batches: observations of shape ``(rows, ...)``, actions ``(rows, A)`` in
+    critic units, integer noise levels ``(rows,)``. Its output has shape ``(rows, E)``.
+
+    Args:
+        module: the network. A module that ignores the noise level is a plain critic ``Q(s, a)``.
+
+    Keyword Args:
+        observation_keys: keys of the observations. Default: those that the module reads and neither
+            writes itself nor knows as action or noise level; ``["observation"]`` for a plain module.
+        action_key: default ``"action"``.
+        noise_level_key: default ``"noise_level"``.
+        value_key: default ``"state_action_value"``.
+        first_level: see :class:`NoiseLevelCriticBase`.
+
+    Raises:
+        ValueError: if the module does not read the action or does not write the value.
+    """
+
+    def __init__(
+        self,
+        module: nn.Module,
+        *,
+        observation_keys: Sequence[NestedKey] | None = None,
+        action_key: NestedKey = "action",
+        noise_level_key: NestedKey = "noise_level",
+        value_key: NestedKey = "state_action_value",
+        first_level: int = 1,
+    ) -> None:
+        inner = module
+        if not isinstance(module, TensorDictModuleBase):
+            keys = [*(observation_keys or ["observation"]), action_key, noise_level_key]
+            inner = TensorDictModule(module, in_keys=keys, out_keys=[value_key])
+        if action_key not in inner.in_keys or value_key not in inner.out_keys:
+            raise ValueError(
+                f"A critic must read the action {action_key!r} and write the value {value_key!r}, but "
+                f"this one reads {list(inner.in_keys)} and writes {list(inner.out_keys)}. Rename its "
+                "keys, or pass action_key= and value_key= to CustomCritic."
+            )
+        if observation_keys is None:
+            row_keys = (action_key, noise_level_key)
+            observation_keys = [key for key in inner.in_keys if key not in row_keys]
+        super().__init__(observation_keys, action_key, noise_level_key, value_key, first_level)
+        self.module = module
+        encoder, head = _split(inner, {action_key, noise_level_key})
+        # Both share `module`'s submodules: kept out of the module tree so that each is listed once.
+        self.__dict__["_encoder"] = encoder
+        self.__dict__["_head"] = head
+        self._feature_keys = [key for key in head.in_keys if key not in (action_key, noise_level_key)]
+
+    def encode(self, *observations: Tensor) -> TensorDict:
+        """What the head reads of ``B`` states, as a TensorDict of batch size ``(B,)``."""
+        states = TensorDict(batch_size=observations[0].shape[:1])
+        for key, observation in zip(self.observation_keys, observations, strict=True):
+            states.set(key, observation)
+        return self._encoder(states).select(*self._feature_keys)
+
+    def evaluate(self, features: Any, action: Tensor, noise_level: Tensor) -> Tensor:
+        """See :meth:`NoiseLevelCriticBase.evaluate`."""
+        batch = action.shape[:-1]
+        rows = features.expand(batch).reshape(-1)
+        rows.set(self.action_key, action.reshape(-1, action.shape[-1]))
+        rows.set(self.noise_level_key, noise_level.expand(batch).reshape(-1))
+        value = self._head(rows).get(self.value_key)
+        if value.ndim != 2:
+            raise ValueError(
+                f"A critic's output must have shape (rows, E), here ({rows.shape[0]}, E) with one "
+                f"column per critic; got {tuple(value.shape)}. A single critic has E = 1."
+            )
+        return value.reshape(*batch, -1)
+
+
+def as_noise_level_critic(critic: nn.Module) -> NoiseLevelCriticBase:
+    """``critic`` itself where it is a noise-level critic already, else a :class:`CustomCritic`."""
+    if isinstance(critic, NoiseLevelCriticBase):
+        return critic
+    if isinstance(critic, nn.Module):
+        return CustomCritic(critic)
+    raise TypeError(f"A critic must be an nn.Module, got {type(critic).__name__}.")
+
+
+def _split(
+    module: TensorDictModuleBase, row_keys: set[NestedKey]
+) -> tuple[TensorDictSequential, TensorDictSequential]:
+    """Split a sequence into what depends on the state alone and what depends on ``row_keys``."""
+    parts = list(module.module) if isinstance(module, TensorDictSequential) else [module]
+    encoder, head = [], []
+    for part in parts:
+        if row_keys.isdisjoint(part.in_keys):
+            encoder.append(part)
+        else:
+            head.append(part)
+            row_keys = row_keys.union(part.out_keys)
+    return TensorDictSequential(*encoder), TensorDictSequential(*head)

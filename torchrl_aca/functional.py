@@ -1,0 +1,171 @@
+"""The equations of ACA, one pure function each: tensors in, tensors out.
+
+Notation, the paper's: ``s`` state, ``a_0`` clean action, ``a_t`` action at noise level ``t`` in
+``1..T``, ``A`` action dimension, ``alpha_bar_t`` = ``alphas_cumprod``, ``sigma_t`` = posterior
+standard deviation, ``w`` = guidance weight. Actions here are always in critic units, [-1, 1].
+"Paper" is *Actor-Critic without Actor*, arXiv 2509.21022.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+__all__ = [
+    "activation_and_slope",
+    "add_noise",
+    "cosine_betas",
+    "guided_noise",
+    "linear_betas",
+    "mish_and_slope",
+    "noise_level_target",
+    "normalize_gradient",
+    "posterior_mean",
+    "predict_clean",
+    "select_best",
+    "sinusoidal_embedding",
+    "surrogate_entropy",
+    "vp_betas",
+]
+
+
+# --- noise schedules ------------------------------------------------------------------------------
+
+
+def cosine_betas(num_steps: int, offset: float = 0.008, beta_max: float = 0.999) -> Tensor:
+    """Cosine schedule (Nichol & Dhariwal 2021, eq. 17); ACA's own with ``num_steps=20``.
+
+    ``beta_t = min(1 - g(t) / g(t - 1), beta_max)``, ``g(t) = cos^2((t/T + offset)/(1 + offset) pi/2)``.
+
+    Returns:
+        Float64 tensor of shape ``(num_steps,)``; entry ``k - 1`` belongs to noise level ``k``.
+    """
+    grid = torch.arange(num_steps + 1, dtype=torch.float64) / num_steps
+    g = torch.cos((grid + offset) / (1 + offset) * math.pi / 2) ** 2
+    return (1 - g[1:] / g[:-1]).clamp(max=beta_max)
+
+
+def linear_betas(
+    num_steps: int, beta_start: float = 1e-4, beta_end: float = 0.02, scale: float = 1.0
+) -> Tensor:
+    """Linear schedule (Ho et al. 2020): ``scale * linspace(beta_start, beta_end, num_steps)``."""
+    return scale * torch.linspace(beta_start, beta_end, num_steps, dtype=torch.float64)
+
+
+def vp_betas(num_steps: int, beta_min: float = 0.1, beta_max: float = 10.0) -> Tensor:
+    """Variance-preserving schedule (Song et al. 2021), discretised as in Diffusion-QL.
+
+    ``beta_t = 1 - exp(-beta_min / T - (beta_max - beta_min) (2t - 1) / (2 T^2))``.
+    """
+    t = torch.arange(1, num_steps + 1, dtype=torch.float64)
+    rate = beta_min / num_steps + (beta_max - beta_min) * (2 * t - 1) / (2 * num_steps**2)
+    return 1 - torch.exp(-rate)
+
+
+# --- forward and reverse diffusion ----------------------------------------------------------------
+
+
+def add_noise(action: Tensor, noise: Tensor, alpha_cumprod: Tensor) -> Tensor:
+    """Forward process: ``a_t = sqrt(alpha_bar_t) a_0 + sqrt(1 - alpha_bar_t) eps``."""
+    return alpha_cumprod.sqrt() * action + (1 - alpha_cumprod).sqrt() * noise
+
+
+def guided_noise(gradient: Tensor, guidance_weight: float | Tensor, sigma: Tensor) -> Tensor:
+    """Noise prediction of the critic (Definition 1): ``eps_hat = -w sigma_t grad_a Q(s, a_t, t)``."""
+    return -guidance_weight * sigma * gradient
+
+
+def normalize_gradient(gradient: Tensor, eps: float = 1e-8) -> Tensor:
+    """Unit-length gradient over the action dimensions: ``g / (||g||_2 + eps)`` (appendix)."""
+    return gradient / (torch.linalg.vector_norm(gradient, dim=-1, keepdim=True) + eps)
+
+
+def predict_clean(noisy_action: Tensor, noise: Tensor, alpha_cumprod: Tensor) -> Tensor:
+    """Clean estimate: ``a_0 = a_t / sqrt(alpha_bar_t) - sqrt(1 / alpha_bar_t - 1) eps_hat``."""
+    return noisy_action / alpha_cumprod.sqrt() - (1 / alpha_cumprod - 1).sqrt() * noise
+
+
+def posterior_mean(clean: Tensor, noisy_action: Tensor, coef1: Tensor, coef2: Tensor) -> Tensor:
+    """Mean of ``q(a_{t-1} | a_t, a_0) = c1_t a_0 + c2_t a_t`` (Ho et al. 2020, eq. 7)."""
+    return coef1 * clean + coef2 * noisy_action
+
+
+# --- critic ---------------------------------------------------------------------------------------
+
+
+def sinusoidal_embedding(noise_level: Tensor, dim: int) -> Tensor:
+    """Sinusoidal features of the raw noise level.
+
+    ``[sin(t f_j)]_j, [cos(t f_j)]_j``, ``f_j = 10000^(-2j / dim)``, ``j = 0..dim/2 - 1``, all divided
+    by ``sqrt(dim)`` as the official code does.
+
+    Args:
+        noise_level: floating-point levels of any shape ``(*,)``.
+        dim: even number of features.
+
+    Returns:
+        Tensor of shape ``(*, dim)``.
+    """
+    exponent = torch.arange(dim // 2, device=noise_level.device, dtype=noise_level.dtype)
+    angle = noise_level.unsqueeze(-1) * 10000.0 ** (-2 * exponent / dim)
+    return torch.cat([angle.sin(), angle.cos()], dim=-1) / math.sqrt(dim)
+
+
+def mish_and_slope(x: Tensor) -> tuple[Tensor, Tensor]:
+    """``mish(x) = x tanh(softplus(x))`` and its derivative from one shared exponential.
+
+    With ``e = exp(x)`` and ``n = e (e + 2)``: ``tanh(softplus(x)) = n / (n + 2)``, whose derivative
+    is ``4 e (e + 1) / (n + 2)^2``. Beyond ``x = 20`` both are their limits 1 and 0 to the last
+    bit of float64, so the exponent is cut there and never overflows.
+    """
+    e = torch.exp(x.clamp(max=20.0))
+    n = e * (e + 2)
+    inverse = 1 / (n + 2)
+    gate = n * inverse
+    return x * gate, gate + x * (4 * e * (e + 1)) * inverse.square()
+
+
+def activation_and_slope(activation: nn.Module, x: Tensor) -> tuple[Tensor, Tensor]:
+    """``f(x)`` and ``f'(x)`` of an elementwise activation, in one forward-mode pass."""
+    if isinstance(activation, nn.Mish):
+        return mish_and_slope(x)
+    return torch.func.jvp(activation, (x,), (torch.ones_like(x),))
+
+
+def noise_level_target(clean_value: Tensor, kind: str) -> Tensor:
+    """Regression target of the noise-level loss, from ``Q(s, a_0, 0)`` of shape ``(*batch, E)``.
+
+    ``"self"``: each critic's own value (paper, critic objective); ``"mean"``: the mean over the
+    critics (official code). The caller stops the gradient.
+    """
+    if kind == "self":
+        return clean_value
+    return clean_value.mean(-1, keepdim=True).expand_as(clean_value)
+
+
+# --- acting ---------------------------------------------------------------------------------------
+
+
+def select_best(candidates: Tensor, values: Tensor) -> Tensor:
+    """Best of N: the candidate whose smallest critic value is largest; the first of equals.
+
+    Args:
+        candidates: actions of shape ``(N, *batch, A)``.
+        values: critic values of shape ``(N, *batch, E)``.
+
+    Returns:
+        Tensor of shape ``(*batch, A)``.
+    """
+    best = values.amin(-1).argmax(0)
+    return candidates.take_along_dim(best[None, ..., None], dim=0).squeeze(0)
+
+
+def surrogate_entropy(log_alpha: Tensor, action_dim: int, noise_scale: float = 0.1) -> Tensor:
+    """Entropy of the exploration noise ``N(0, (noise_scale * alpha)^2 I)``, in nats.
+
+    ``H = A/2 log(2 pi e (noise_scale * alpha)^2)``. It depends on no data: alpha follows an
+    open-loop schedule towards ``noise_scale * alpha = exp(H_target / A) / sqrt(2 pi e)``.
+    """
+    return action_dim * (0.5 * math.log(2 * math.pi * math.e) + math.log(noise_scale) + log_alpha)

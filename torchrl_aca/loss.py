@@ -1,0 +1,369 @@
+"""The loss of ACA: TD regression at level 0, noise-level regression above it, and alpha's schedule."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict.nn import dispatch
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torchrl.objectives import LossModule, ValueEstimators
+from torchrl.objectives.utils import dispatch_value_estimator, distance_loss
+
+from torchrl_aca import functional as F
+from torchrl_aca.actor import CriticGuidedDenoisingActor
+from torchrl_aca.critic import NoiseLevelCriticBase
+
+__all__ = ["ACALoss"]
+
+
+class ACALoss(LossModule):
+    """Loss module of *Actor-Critic without Actor* (arXiv 2509.21022).
+
+    Three losses, each to be had alone as a TensorDict of its ``loss_*`` entry and metrics:
+
+    - :meth:`qvalue_loss`: ``sum_i (Q_i(s, a_0, 0) - y)^2`` with ``y = c r + gamma (1 - terminated)
+      min_i Q_bar_i(s', a'_0, 0)``, ``a'_0`` from the actor on the online critics, exploration noise
+      included;
+    - :meth:`noise_level_loss`: ``sum_i (Q_i(s, a_t, t) - stop_grad(target))^2`` with ``t`` uniform over
+      the noisy levels, where the target is made of ``Q(s, a_0, 0)``;
+    - :meth:`alpha_loss`: ``log_alpha * stop_grad(H(alpha) - H_target)``.
+
+    :meth:`forward` gives all three, as the paper's summed objective. The official code instead takes
+    an optimiser step on the first, and at every second update another on the second, computed after
+    the first step: call the methods one by one for that.
+
+    The loss holds the very parameters of ``actor_network.critic`` and its ``log_alpha``, so actor,
+    optimiser and collector never need synchronising in one process.
+
+    Args:
+        actor_network: the actor; its critic is the network that is trained.
+
+    Keyword Args:
+        qvalue_network: may be passed for symmetry with TorchRL's losses; must be the actor's critic.
+        num_target_candidates: ``N`` of ``a'_0``. Default: the actor's ``num_candidates``.
+        noise_level_target: ``"mean"`` over the critics (official code) or each critic's own value,
+            ``"self"`` (paper). Default: ``"mean"``.
+        target_entropy: ``H_target`` in nats, or ``"auto"`` for ``-target_entropy_scale * A``.
+        target_entropy_scale: default 0.9.
+        entropy_noise_scale: the noise scale inside ``H``. The official code has 0.1 here whatever
+            the exploration noise. Default: 0.1.
+        reward_scale: ``c``. Default: 0.2.
+        loss_function: distance of both regressions. Default: ``"l2"``.
+        delay_qvalue: bootstrap from target parameters, to be moved by a ``SoftUpdate`` or
+            ``HardUpdate``. Default: True.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"``; with ``"none"`` the losses have the shape of
+            the input and metrics are left out. Default: ``"mean"``.
+        use_prioritized_weights: weigh rows by ``priority_weight`` where it is present. Default:
+            ``"auto"``.
+
+    Random draws are taken from the input where it has them: ``noise_level`` (``1..T``, or ``0..T-1``
+    with ``first_level=0``), ``noise`` (standard normal, shape of the action) and ``next_action``
+    (``a'_0`` in env units).
+
+    Raises:
+        ValueError: on an unknown option, or a ``qvalue_network`` that is not the actor's critic.
+
+    Examples:
+        >>> actor = CriticGuidedDenoisingActor(NoiseLevelCritic(3, 2), NoiseSchedule.cosine(20))
+        >>> loss = ACALoss(actor, num_target_candidates=4)
+        >>> updater = SoftUpdate(loss, tau=0.005)
+        >>> losses = loss(data)
+        >>> total = losses["loss_qvalue"] + losses["loss_noise_level"] + losses["loss_alpha"]
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that ``set_keys`` can change.
+
+        Attributes:
+            action: the action, in env units.
+            value: where the value estimator finds the next state's value.
+            state_action_value: the critic's output.
+            noise_level: optional given noise levels.
+            noise: optional given noise of the noise-level loss.
+            next_action: optional given next action, in env units.
+            priority: where the TD error for prioritised replay is written.
+            reward: the reward, below ``"next"``.
+            done: the done flag, below ``"next"``.
+            terminated: the terminated flag, below ``"next"``.
+            priority_weight: importance weights of prioritised replay.
+        """
+
+        action: NestedKey = "action"
+        value: NestedKey = "state_value"
+        state_action_value: NestedKey = "state_action_value"
+        noise_level: NestedKey = "noise_level"
+        noise: NestedKey = "noise"
+        next_action: NestedKey = "next_action"
+        priority: NestedKey = "td_error"
+        reward: NestedKey = "reward"
+        done: NestedKey = "done"
+        terminated: NestedKey = "terminated"
+        priority_weight: NestedKey = "priority_weight"
+
+    default_keys = _AcceptedKeys
+    tensor_keys: _AcceptedKeys
+    default_value_estimator = ValueEstimators.TD0
+    SUPPORTED_VALUE_ESTIMATORS = (
+        ValueEstimators.TD0,
+        ValueEstimators.TD1,
+        ValueEstimators.TDLambda,
+    )
+
+    actor_network: CriticGuidedDenoisingActor
+    qvalue_network: NoiseLevelCriticBase
+    qvalue_network_params: TensorDictParams
+    target_qvalue_network_params: TensorDictParams
+    target_entropy: Tensor
+
+    def __init__(
+        self,
+        actor_network: CriticGuidedDenoisingActor,
+        *,
+        qvalue_network: nn.Module | None = None,
+        num_target_candidates: int | None = None,
+        noise_level_target: Literal["mean", "self"] = "mean",
+        target_entropy: float | Literal["auto"] = "auto",
+        target_entropy_scale: float = 0.9,
+        entropy_noise_scale: float = 0.1,
+        reward_scale: float = 0.2,
+        loss_function: str = "l2",
+        delay_qvalue: bool = True,
+        reduction: Literal["none", "mean", "sum"] | None = None,
+        use_prioritized_weights: bool | Literal["auto"] = "auto",
+    ) -> None:
+        self._in_keys: list[NestedKey] | None = None
+        self._out_keys: list[str] | None = None
+        super().__init__()
+        critic = actor_network.critic
+        if qvalue_network not in (None, critic, getattr(critic, "module", None)):
+            raise ValueError(
+                "qvalue_network must be actor_network.critic: in ACA the critic is the actor. "
+                "Leave it out, or build the actor with this network."
+            )
+        if noise_level_target not in ("mean", "self"):
+            raise ValueError(
+                f'noise_level_target must be "mean" or "self", got {noise_level_target!r}.'
+            )
+        if num_target_candidates is not None and num_target_candidates < 1:
+            raise ValueError(f"num_target_candidates must be >= 1, got {num_target_candidates}.")
+        # The actor is no submodule: its parameters are listed below, and only once.
+        self.__dict__["actor_network"] = actor_network
+        self.convert_to_functional(critic, "qvalue_network", create_target_params=delay_qvalue)
+        self.log_alpha = actor_network.log_alpha
+        self.delay_qvalue = delay_qvalue
+        self.num_target_candidates = num_target_candidates or actor_network.num_candidates
+        self.noise_level_target = noise_level_target
+        self.entropy_noise_scale = entropy_noise_scale
+        self.reward_scale = reward_scale
+        self.loss_function = loss_function
+        self.reduction = reduction or "mean"
+        self.use_prioritized_weights = use_prioritized_weights
+        if target_entropy == "auto":
+            target_entropy = -target_entropy_scale * actor_network.action_dim
+        self.register_buffer("target_entropy", self.log_alpha.new_tensor(target_entropy))
+        self.set_keys(
+            action=actor_network.out_keys[0],
+            state_action_value=critic.value_key,
+            noise_level=critic.noise_level_key,
+        )
+
+    # --- the three losses -------------------------------------------------------------------------
+
+    def qvalue_loss(self, tensordict: TensorDictBase) -> TensorDict:
+        """TD loss at level 0; writes the TD error, shape ``(*batch,)``, to ``tensordict``."""
+        observation, action = self._state_and_action(tensordict)
+        target = self._target_value(tensordict)
+        value = self._value(observation, action, self._clean_level(action))
+        error = distance_loss(value, target.expand_as(value), self.loss_function).sum(-1)
+        td_error = (value.detach() - target).abs().amax(-1)
+        tensordict.set(self.tensor_keys.priority, td_error)
+        metrics = {"pred_value": value.detach().mean(), "target_value": target.mean()}
+        return self._output("loss_qvalue", error, tensordict, metrics)
+
+    def noise_level_loss(self, tensordict: TensorDictBase) -> TensorDict:
+        """Regression of ``Q(s, a_t, t)`` on ``Q(s, a_0, 0)``."""
+        observation, action = self._state_and_action(tensordict)
+        schedule, first_level = self.actor_network.schedule, self.qvalue_network.first_level
+        level = tensordict.get(self.tensor_keys.noise_level, None)
+        if level is None:
+            high = first_level + schedule.num_steps
+            level = torch.randint(first_level, high, action.shape[:-1], device=action.device)
+        noise = tensordict.get(self.tensor_keys.noise, None)
+        noise = torch.randn_like(action) if noise is None else noise
+        noisy_action = schedule.add_noise(action, noise, level - first_level + 1)
+        with torch.no_grad():
+            clean_value = self._value(observation, action, self._clean_level(action))
+            target = F.noise_level_target(clean_value, self.noise_level_target)
+        value = self._value(observation, noisy_action, level)
+        error = distance_loss(value, target, self.loss_function).sum(-1)
+        metrics = {"noisy_value": value.detach().mean()}
+        return self._output("loss_noise_level", error, tensordict, metrics)
+
+    def alpha_loss(self, tensordict: TensorDictBase | None = None) -> TensorDict:
+        """Open-loop schedule of the exploration noise; depends on no data.
+
+        Args:
+            tensordict: gives the shape of the loss where ``reduction="none"``; otherwise unused.
+        """
+        actor = self.actor_network
+        with torch.no_grad():
+            entropy = F.surrogate_entropy(
+                self.log_alpha, actor.action_dim, self.entropy_noise_scale
+            )
+        loss = self.log_alpha * (entropy - self.target_entropy)
+        alpha = self.log_alpha.detach().exp()
+        if self.reduction == "none" and tensordict is not None:
+            shape = tensordict.batch_size
+            return TensorDict({"loss_alpha": loss.expand(shape)}, batch_size=shape)
+        metrics = {
+            "alpha": alpha,
+            "entropy": entropy,
+            "exploration_std": alpha * actor.exploration_noise,
+        }
+        return TensorDict({"loss_alpha": loss, **metrics})
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """All three losses and their metrics; see the class."""
+        out = self.qvalue_loss(tensordict)
+        out.update(self.noise_level_loss(tensordict))
+        out.update(self.alpha_loss(tensordict))
+        return out
+
+    # --- their parts ------------------------------------------------------------------------------
+
+    def _value(
+        self,
+        observation: Sequence[Tensor],
+        action: Tensor,
+        noise_level: Tensor,
+        params: TensorDictParams | None = None,
+    ) -> Tensor:
+        """Critic values of shape ``(*batch, E)`` under ``params`` (default: the online ones)."""
+        critic, batch = self.qvalue_network, action.shape[:-1]
+        rows = [o.reshape(-1, *o.shape[len(batch) :]) for o in observation]
+        params = self.qvalue_network_params if params is None else params
+        with params.to_module(critic, preserve_module_state=False):
+            value = critic.evaluate(
+                critic.encode(*rows), action.reshape(-1, action.shape[-1]), noise_level.reshape(-1)
+            )
+        return value.reshape(*batch, -1)
+
+    @torch.no_grad()
+    def _target_value(self, tensordict: TensorDictBase) -> Tensor:
+        """TD target ``y`` of shape ``(*batch, 1)``, made by the value estimator."""
+        actor, keys = self.actor_network, self.tensor_keys
+        observation = [tensordict.get(("next", key)) for key in actor.in_keys]
+        next_action = tensordict.get(keys.next_action, None)
+        if next_action is None:
+            batch = tensordict.get(keys.action).shape[:-1]
+            next_action = actor.sample(
+                observation, batch, num_candidates=self.num_target_candidates
+            )
+        next_action = actor.from_env(next_action)
+        next_value = self._value(
+            observation,
+            next_action,
+            self._clean_level(next_action),
+            self.target_qvalue_network_params,
+        ).amin(-1, keepdim=True)
+        # A terminal state may hold anything, NaN included: its value is zero, not zero times that.
+        terminated = tensordict.get(("next", keys.terminated))
+        next_value = next_value.masked_fill(terminated.reshape(next_value.shape), 0.0)
+        data = tensordict.clone(recurse=False)
+        data.set(("next", keys.reward), self.reward_scale * data.get(("next", keys.reward)))
+        data.set(("next", self.value_estimator.tensor_keys.value), next_value)
+        return self.value_estimator.value_estimate(data).reshape(next_value.shape)
+
+    def _state_and_action(self, tensordict: TensorDictBase) -> tuple[list[Tensor], Tensor]:
+        """Observations as they are, and the action in critic units."""
+        action = tensordict.get(self.tensor_keys.action)
+        observation = [tensordict.get(key) for key in self.actor_network.in_keys]
+        return observation, self.actor_network.from_env(action)
+
+    @staticmethod
+    def _clean_level(action: Tensor) -> Tensor:
+        return torch.zeros(action.shape[:-1], dtype=torch.long, device=action.device)
+
+    def _output(
+        self, name: str, error: Tensor, tensordict: TensorDictBase, metrics: dict[str, Tensor]
+    ) -> TensorDict:
+        weights = self._maybe_get_priority_weight(tensordict)
+        loss = self._reduce_loss(error, tensordict, weights=weights)
+        if self.reduction == "none":
+            return TensorDict({name: loss}, batch_size=tensordict.batch_size)
+        return TensorDict({name: loss, **metrics})
+
+    # --- the LossModule contract ------------------------------------------------------------------
+
+    def make_value_estimator(
+        self, value_type: ValueEstimators | None = None, **hyperparams: Any
+    ) -> Any:
+        """Set the value estimator: TD0 (default), TD1 or TD(lambda); see ``LossModule``."""
+        value_type, hyperparams = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
+        if value_type is not None:
+            dispatch_value_estimator(
+                self,
+                value_type,
+                supported=self.SUPPORTED_VALUE_ESTIMATORS,
+                tensor_keys={"value_target": "value_target", **self._estimator_keys()},
+                value_network=None,
+                **hyperparams,
+            )
+        return self
+
+    def _estimator_keys(self) -> dict[str, NestedKey]:
+        names = ("value", "reward", "done", "terminated")
+        return {name: getattr(self.tensor_keys, name) for name in names}
+
+    def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
+        if self._value_estimator is not None:
+            self._value_estimator.set_keys(**self._estimator_keys())
+        self._in_keys = None
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Keys that the loss reads; random draws are optional and not listed."""
+        if self._in_keys is None:
+            keys, observation_keys = self.tensor_keys, self.actor_network.in_keys
+            self._in_keys = [
+                keys.action,
+                *observation_keys,
+                *(_next(key) for key in (keys.reward, keys.done, keys.terminated)),
+                *(_next(key) for key in observation_keys),
+            ]
+        return self._in_keys
+
+    @in_keys.setter
+    def in_keys(self, values: list[NestedKey]) -> None:
+        self._in_keys = values
+
+    @property
+    def out_keys(self) -> list[str]:
+        """The losses, then the metrics."""
+        if self._out_keys is None:
+            losses = ["loss_qvalue", "loss_noise_level", "loss_alpha"]
+            metrics = ["pred_value", "target_value", "noisy_value"]
+            metrics += ["alpha", "entropy", "exploration_std"]
+            self._out_keys = losses if self.reduction == "none" else losses + metrics
+        return self._out_keys
+
+    @out_keys.setter
+    def out_keys(self, values: list[str]) -> None:
+        self._out_keys = values
+
+    def _apply(self, fn: Callable) -> ACALoss:
+        """Take the actor along: its buffers are not the loss's, its parameters are the same."""
+        super()._apply(fn)
+        self.actor_network._apply(fn)
+        return self
+
+
+def _next(key: NestedKey) -> NestedKey:
+    return ("next", key) if isinstance(key, str) else ("next", *key)
