@@ -117,10 +117,10 @@ def mish_and_slope(x: Tensor) -> tuple[Tensor, Tensor]:
     """``mish(x) = x tanh(softplus(x))`` and its derivative from one shared exponential.
 
     With ``e = exp(x)`` and ``n = e (e + 2)``: ``tanh(softplus(x)) = n / (n + 2)``, whose derivative
-    is ``4 e (e + 1) / (n + 2)^2``. Beyond ``x = 20`` both are their limits 1 and 0 to the last
+    is ``4 e (e + 1) / (n + 2)^2``. Beyond ``x = 40`` both are their limits 1 and 0 to the last
     bit of float64, so the exponent is cut there and never overflows.
     """
-    e = torch.exp(x.clamp(max=20.0))
+    e = torch.exp(x.clamp(max=40.0))
     n = e * (e + 2)
     inverse = 1 / (n + 2)
     gate = n * inverse

@@ -1,7 +1,8 @@
-"""The loss of ACA: TD regression at level 0, noise-level regression above it, and alpha's schedule."""
+"""The loss of ACA: TD regression at level 0, noise-level regression above it, alpha's schedule."""
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -29,12 +30,12 @@ class ACALoss(LossModule):
     - :meth:`qvalue_loss`: ``sum_i (Q_i(s, a_0, 0) - y)^2`` with ``y = c r + gamma (1 - terminated)
       min_i Q_bar_i(s', a'_0, 0)``, ``a'_0`` from the actor on the online critics, exploration noise
       included;
-    - :meth:`noise_level_loss`: ``sum_i (Q_i(s, a_t, t) - stop_grad(target))^2`` with ``t`` uniform over
-      the noisy levels, where the target is made of ``Q(s, a_0, 0)``;
+    - :meth:`noise_level_loss`: ``sum_i (Q_i(s, a_t, t) - stop_grad(target))^2`` with ``t`` uniform
+      over the noisy levels, where the target is made of ``Q(s, a_0, 0)``;
     - :meth:`alpha_loss`: ``log_alpha * stop_grad(H(alpha) - H_target)``.
 
-    :meth:`forward` gives all three, as the paper's summed objective. The official code instead takes
-    an optimiser step on the first, and at every second update another on the second, computed after
+    :meth:`forward` gives all three, as the paper's summed objective. The official code instead
+    takes an optimiser step on the first, and at every second update another on the second, computed after
     the first step: call the methods one by one for that.
 
     The loss holds the very parameters of ``actor_network.critic`` and its ``log_alpha``, so actor,
@@ -44,7 +45,8 @@ class ACALoss(LossModule):
         actor_network: the actor; its critic is the network that is trained.
 
     Keyword Args:
-        qvalue_network: may be passed for symmetry with TorchRL's losses; must be the actor's critic.
+        qvalue_network: may be passed for symmetry with TorchRL's losses; must be the actor's
+            critic.
         num_target_candidates: ``N`` of ``a'_0``. Default: the actor's ``num_candidates``.
         noise_level_target: ``"mean"`` over the critics (official code) or each critic's own value,
             ``"self"`` (paper). Default: ``"mean"``.
@@ -61,8 +63,8 @@ class ACALoss(LossModule):
         use_prioritized_weights: weigh rows by ``priority_weight`` where it is present. Default:
             ``"auto"``.
 
-    Random draws are taken from the input where it has them: ``noise_level`` (``1..T``, or ``0..T-1``
-    with ``first_level=0``), ``noise`` (standard normal, shape of the action) and ``next_action``
+    Random draws are taken from the input where it has them: ``noise_level`` (``1..T``, or
+    ``0..T-1`` with ``first_level=0``), ``noise`` (standard normal, shape of the action) and ``next_action``
     (``a'_0`` in env units).
 
     Raises:
@@ -179,7 +181,7 @@ class ACALoss(LossModule):
         """TD loss at level 0; writes the TD error, shape ``(*batch,)``, to ``tensordict``."""
         observation, action = self._state_and_action(tensordict)
         target = self._target_value(tensordict)
-        value = self._value(observation, action, self._clean_level(action))
+        (value,) = self._values(observation, (action, self._clean_level(action)))
         error = distance_loss(value, target.expand_as(value), self.loss_function).sum(-1)
         td_error = (value.detach() - target).abs().amax(-1)
         tensordict.set(self.tensor_keys.priority, td_error)
@@ -197,10 +199,10 @@ class ACALoss(LossModule):
         noise = tensordict.get(self.tensor_keys.noise, None)
         noise = torch.randn_like(action) if noise is None else noise
         noisy_action = schedule.add_noise(action, noise, level - first_level + 1)
-        with torch.no_grad():
-            clean_value = self._value(observation, action, self._clean_level(action))
-            target = F.noise_level_target(clean_value, self.noise_level_target)
-        value = self._value(observation, noisy_action, level)
+        clean_value, value = self._values(
+            observation, (action, self._clean_level(action)), (noisy_action, level)
+        )
+        target = F.noise_level_target(clean_value.detach(), self.noise_level_target)
         error = distance_loss(value, target, self.loss_function).sum(-1)
         metrics = {"noisy_value": value.detach().mean()}
         return self._output("loss_noise_level", error, tensordict, metrics)
@@ -238,53 +240,57 @@ class ACALoss(LossModule):
 
     # --- their parts ------------------------------------------------------------------------------
 
-    def _value(
+    def _values(
         self,
         observation: Sequence[Tensor],
-        action: Tensor,
-        noise_level: Tensor,
+        *queries: tuple[Tensor, Tensor],
         params: TensorDictParams | None = None,
-    ) -> Tensor:
-        """Critic values of shape ``(*batch, E)`` under ``params`` (default: the online ones)."""
-        critic, batch = self.qvalue_network, action.shape[:-1]
+    ) -> list[Tensor]:
+        """Critic values of shape ``(*batch, E)``, one for each (action, level) in ``queries``.
+
+        The states are encoded once for all queries, under ``params`` (default: the online ones).
+        """
+        critic, batch = self.qvalue_network, queries[0][0].shape[:-1]
         rows = [o.reshape(-1, *o.shape[len(batch) :]) for o in observation]
         params = self.qvalue_network_params if params is None else params
         with params.to_module(critic, preserve_module_state=False):
-            value = critic.evaluate(
-                critic.encode(*rows), action.reshape(-1, action.shape[-1]), noise_level.reshape(-1)
-            )
-        return value.reshape(*batch, -1)
+            features = critic.encode(*rows)
+            values = [
+                critic.evaluate(features, action.reshape(-1, action.shape[-1]), level.reshape(-1))
+                for action, level in queries
+            ]
+        return [value.reshape(*batch, -1) for value in values]
 
     @torch.no_grad()
     def _target_value(self, tensordict: TensorDictBase) -> Tensor:
         """TD target ``y`` of shape ``(*batch, 1)``, made by the value estimator."""
         actor, keys = self.actor_network, self.tensor_keys
-        observation = [tensordict.get(("next", key)) for key in actor.in_keys]
+        observation = [tensordict[_next(key)] for key in actor.in_keys]
         next_action = tensordict.get(keys.next_action, None)
         if next_action is None:
-            batch = tensordict.get(keys.action).shape[:-1]
+            batch = tensordict[keys.action].shape[:-1]
             next_action = actor.sample(
                 observation, batch, num_candidates=self.num_target_candidates
             )
         next_action = actor.from_env(next_action)
-        next_value = self._value(
+        (next_values,) = self._values(
             observation,
-            next_action,
-            self._clean_level(next_action),
-            self.target_qvalue_network_params,
-        ).amin(-1, keepdim=True)
+            (next_action, self._clean_level(next_action)),
+            params=self.target_qvalue_network_params,
+        )
+        next_value = next_values.amin(-1, keepdim=True)
         # A terminal state may hold anything, NaN included: its value is zero, not zero times that.
-        terminated = tensordict.get(("next", keys.terminated))
+        terminated = tensordict[_next(keys.terminated)]
         next_value = next_value.masked_fill(terminated.reshape(next_value.shape), 0.0)
         data = tensordict.clone(recurse=False)
-        data.set(("next", keys.reward), self.reward_scale * data.get(("next", keys.reward)))
-        data.set(("next", self.value_estimator.tensor_keys.value), next_value)
+        data.set(_next(keys.reward), self.reward_scale * data[_next(keys.reward)])
+        data.set(_next(self.value_estimator.tensor_keys.value), next_value)
         return self.value_estimator.value_estimate(data).reshape(next_value.shape)
 
     def _state_and_action(self, tensordict: TensorDictBase) -> tuple[list[Tensor], Tensor]:
         """Observations as they are, and the action in critic units."""
-        action = tensordict.get(self.tensor_keys.action)
-        observation = [tensordict.get(key) for key in self.actor_network.in_keys]
+        action = tensordict[self.tensor_keys.action]
+        observation = [tensordict[key] for key in self.actor_network.in_keys]
         return observation, self.actor_network.from_env(action)
 
     @staticmethod
@@ -327,6 +333,12 @@ class ACALoss(LossModule):
             self._value_estimator.set_keys(**self._estimator_keys())
         self._in_keys = None
 
+    def _maybe_get_priority_weight(self, tensordict: TensorDictBase) -> Tensor | None:
+        """As the parent's, whose test for the key fails on nested keys."""
+        if self.use_prioritized_weights not in (True, "auto"):
+            return None
+        return tensordict.get(self.tensor_keys.priority_weight, None)
+
     @property
     def in_keys(self) -> list[NestedKey]:
         """Keys that the loss reads; random draws are optional and not listed."""
@@ -357,6 +369,14 @@ class ACALoss(LossModule):
     @out_keys.setter
     def out_keys(self, values: list[str]) -> None:
         self._out_keys = values
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> ACALoss:
+        """A copy whose actor holds the copy's parameters; TensorDict's own copy would part them."""
+        clone = self.__class__.__new__(self.__class__)
+        memo[id(self)] = clone
+        clone.__dict__.update(copy.deepcopy(self.__dict__, memo))
+        clone.qvalue_network_params.to_module(clone.qvalue_network)
+        return clone
 
     def _apply(self, fn: Callable) -> ACALoss:
         """Take the actor along: its buffers are not the loss's, its parameters are the same."""

@@ -106,15 +106,14 @@ class NoiseSchedule(nn.Module):
         Returns:
             ``a_t`` of shape ``(*batch, A)``.
         """
-        alpha_cumprod = self.alphas_cumprod[noise_level - 1].to(action.dtype)
-        return F.add_noise(action, noise, alpha_cumprod.unsqueeze(-1))
+        return F.add_noise(action, noise, self.at(self.alphas_cumprod, noise_level, action.dtype))
 
     def denoise_step(
         self,
         noisy_action: Tensor,
         predicted_noise: Tensor,
         noise: Tensor,
-        noise_level: int,
+        noise_level: Tensor,
         clip: bool = True,
     ) -> Tensor:
         """One step of the reverse chain, ``a_t -> a_{t-1}`` (Definition 1 of the paper).
@@ -123,25 +122,31 @@ class NoiseSchedule(nn.Module):
             noisy_action: ``a_t`` of shape ``(*batch, A)``.
             predicted_noise: ``eps_hat``, same shape.
             noise: standard normal draws, broadcastable to that shape.
-            noise_level: ``t`` in ``1..T``.
+            noise_level: ``t`` in ``1..T``, an integer tensor of shape ``(*batch,)`` or ``()``.
             clip: clip the clean estimate to [-1, 1] (official code) or leave it (paper's text).
 
         Returns:
             ``a_{t-1}`` of shape ``(*batch, A)``.
         """
-        row, dtype = noise_level - 1, noisy_action.dtype
-        sigma = self.sigma(noise_level).to(dtype)
+        coef1, coef2, alpha_cumprod, variance = (
+            self.at(constants, noise_level, noisy_action.dtype)
+            for constants in (
+                self.posterior_mean_coef1,
+                self.posterior_mean_coef2,
+                self.alphas_cumprod,
+                self.posterior_variance,
+            )
+        )
         # 1. clean estimate   2. its box   3. posterior mean   4. posterior noise
-        clean = F.predict_clean(noisy_action, predicted_noise, self.alphas_cumprod[row].to(dtype))
-        if clip:
-            clean = clean.clamp(-1, 1)
-        coef1 = self.posterior_mean_coef1[row].to(dtype)
-        coef2 = self.posterior_mean_coef2[row].to(dtype)
-        return F.posterior_mean(clean, noisy_action, coef1, coef2) + sigma * noise
+        clean = F.predict_clean(noisy_action, predicted_noise, alpha_cumprod)
+        clean = clean.clamp(-1, 1) if clip else clean
+        return F.posterior_mean(clean, noisy_action, coef1, coef2) + variance.sqrt() * noise
 
-    def sigma(self, noise_level: int) -> Tensor:
-        """Posterior standard deviation ``sigma_t`` at level ``t`` in ``1..T``, a float64 scalar."""
-        return self.posterior_variance[noise_level - 1].sqrt()
+    @staticmethod
+    def at(constants: Tensor, noise_level: Tensor, dtype: torch.dtype) -> Tensor:
+        """Rows of one of the constants, shape ``(*noise_level.shape, 1)``, to go with actions."""
+        rows = constants.index_select(0, noise_level.reshape(-1) - 1)
+        return rows.to(dtype).reshape(*noise_level.shape, 1)
 
     def _apply(self, fn: Callable, recurse: bool = True) -> NoiseSchedule:
         """Follow device moves, ignore casts: the chain divides by numbers as small as 1e-3."""

@@ -1,0 +1,1 @@
+"""Algorithm-free helpers of the recipes: environments, data, evaluation, run directory, resume."""

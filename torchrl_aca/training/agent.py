@@ -1,0 +1,39 @@
+"""The seam between a training loop and an algorithm."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+
+
+class Stateful(Protocol):
+    """Anything that a checkpoint can hold."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the state as tensors, numbers, strings and containers of them."""
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> Any:
+        """Restore what `state_dict` returned."""
+
+
+@dataclass
+class Agent:
+    """All that a training loop needs to know of an algorithm.
+
+    Attributes:
+        policy: Maps observations to actions. The collector calls it under
+            `ExplorationType.RANDOM`, the evaluation under `ExplorationType.DETERMINISTIC`.
+        update: Takes a batch of transitions of shape (B,), makes one update and returns detached
+            scalar metrics. A metric that is not there in every update is averaged over the
+            updates that report it.
+        state: Everything that the next update depends on, by name: the loss with its targets,
+            optimisers, schedulers, counters. It is what a checkpoint saves and restores.
+    """
+
+    policy: TensorDictModuleBase
+    update: Callable[[TensorDictBase], TensorDictBase]
+    state: dict[str, Stateful]

@@ -1,0 +1,140 @@
+"""Checks of a configuration before any long work, and the configuration of a resumed run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from torchrl_aca.training.checkpoint import read_checkpoint
+from torchrl_aca.training.errors import RunError
+
+POSITIVE_INTEGERS = (
+    "collector.num_envs",
+    "collector.frames_per_batch",
+    "collector.init_random_frames",
+    "buffer.capacity",
+    "optim.total_updates",
+    "optim.batch_size",
+    "eval.interval",
+    "eval.episodes",
+    "checkpoint.interval",
+    "checkpoint.keep_last",
+    "logger.interval",
+)
+RANGES = {
+    "optim.utd_ratio": (0, float("inf")),
+    "optim.lr": (0, float("inf")),
+    "optim.gamma": (0, 1),
+    "optim.tau": (0, 1),
+}
+MAY_CHANGE_ON_RESUME = ("optim.total_updates", "num_threads", "logger", "checkpoint", "video")
+NOT_COMPARED = (*MAY_CHANGE_ON_RESUME, "resume", "run_dir")
+LOGGERS = ("csv", "wandb", "tensorboard", "none")
+
+
+def validate(cfg: DictConfig, algorithms: Iterable[str]) -> None:
+    """Checks what can be checked without building anything.
+
+    Raises:
+        RunError: Naming the key, what was expected and what was got.
+    """
+    _require(cfg.algo.name in algorithms, cfg, "algo.name", f"one of {sorted(algorithms)}")
+    _require(cfg.logger.backend in LOGGERS, cfg, "logger.backend", f"one of {list(LOGGERS)}")
+    for key in POSITIVE_INTEGERS:
+        value = OmegaConf.select(cfg, key)
+        _require(isinstance(value, int) and value > 0, cfg, key, "a positive integer")
+    for key, (low, high) in RANGES.items():
+        value = OmegaConf.select(cfg, key)
+        fits = isinstance(value, int | float) and low < value <= high
+        _require(fits, cfg, key, f"a number above {low}, at most {high}")
+    if cfg.num_threads is not None:
+        fits = isinstance(cfg.num_threads, int) and cfg.num_threads > 0
+        _require(fits, cfg, "num_threads", "a positive integer or null")
+    for name, section in cfg.items():
+        if isinstance(section, DictConfig) and "num_cells" in section:
+            fits = all(isinstance(cells, int) and cells > 0 for cells in section.num_cells)
+            _require(fits, cfg, f"{name}.num_cells", "positive integers, one per hidden layer")
+    _validate_sizes(cfg)
+
+
+def _validate_sizes(cfg: DictConfig) -> None:
+    batch, frames = cfg.optim.batch_size, cfg.collector.frames_per_batch
+    copies, warmup = cfg.collector.num_envs, cfg.collector.init_random_frames
+    fits = "at least optim.batch_size"
+    _require(cfg.buffer.capacity >= batch, cfg, "buffer.capacity", f"{fits} ({batch})")
+    _require(warmup >= batch, cfg, "collector.init_random_frames", f"{fits} ({batch})")
+    _require(
+        frames % copies == 0,
+        cfg,
+        "collector.frames_per_batch",
+        f"a multiple of collector.num_envs ({copies})",
+    )
+    _require(
+        warmup % frames == 0,
+        cfg,
+        "collector.init_random_frames",
+        f"a multiple of collector.frames_per_batch ({frames})",
+    )
+
+
+def _require(condition: bool, cfg: DictConfig, key: str, expected: str) -> None:
+    if not condition:
+        value = OmegaConf.select(cfg, key)
+        raise RunError(f"{key}={value!r}: expected {expected}. Set it with {key}=... .")
+
+
+def resumed_config(cfg: DictConfig, overrides: Iterable[str]) -> tuple[DictConfig, dict[str, Any]]:
+    """Returns the stored configuration of the run in `cfg.resume` and its newest checkpoint.
+
+    Args:
+        cfg: The configuration that was composed for this call.
+        overrides: What the user typed, such as "optim.total_updates=2000".
+
+    Raises:
+        RunError: If there is no run, or an override would change what the run is.
+    """
+    run_dir = Path(cfg.resume)
+    if not (run_dir / "config.yaml").is_file():
+        raise RunError(
+            f"resume={cfg.resume}: expected a run directory with config.yaml and checkpoints/, "
+            "found no config.yaml. Give the directory that the run printed when it started."
+        )
+    stored = OmegaConf.load(run_dir / "config.yaml")
+    checkpoint = read_checkpoint(run_dir)
+    # The checkpoint knows how its networks were built; the file may have been edited since.
+    _require_equal(stored, OmegaConf.create(checkpoint["config"]), stored, "config.yaml")
+    typed = {override.split("=")[0].lstrip("+~") for override in overrides} - {"resume"}
+    for key in sorted(typed):
+        part = OmegaConf.create({})
+        OmegaConf.update(part, key, OmegaConf.select(cfg, key))
+        _require_equal(part, stored, part, "the command line")
+        OmegaConf.update(stored, key, OmegaConf.select(cfg, key))
+    done = checkpoint["parts"]["counters"]["updates"]
+    if done >= stored.optim.total_updates:
+        raise RunError(
+            f"resume={cfg.resume}: the run already has {done} updates; expected "
+            f"optim.total_updates above that, got {stored.optim.total_updates}. Raise it."
+        )
+    stored.resume = str(run_dir)
+    return stored, checkpoint
+
+
+def _require_equal(
+    new: DictConfig, run: DictConfig, keys: DictConfig, where: str, prefix: str = ""
+) -> None:
+    for name in keys:
+        key = f"{prefix}{name}"
+        if any(key == free or key.startswith(f"{free}.") for free in NOT_COMPARED):
+            continue
+        value = OmegaConf.select(new, key)
+        if isinstance(value, DictConfig):
+            _require_equal(new, run, value, where, f"{key}.")
+        elif value != OmegaConf.select(run, key):
+            raise RunError(
+                f"{where} has {key}={value}, but the run to resume has "
+                f"{key}={OmegaConf.select(run, key)}. Only {', '.join(MAY_CHANGE_ON_RESUME)} may "
+                f"change: leave {key} out, or start a new run without resume=."
+            )

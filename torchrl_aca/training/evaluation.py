@@ -1,0 +1,102 @@
+"""Evaluation over whole episodes, without a trace in the training's random streams."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from torchrl_aca.training.envs import make_env
+from torchrl_aca.training.errors import RunError
+
+Policy = Callable[[TensorDictBase], TensorDictBase]
+
+
+@contextmanager
+def evaluation_mode(seed: int) -> Iterator[None]:
+    """No gradients, deterministic actions, and random numbers of its own that start at `seed`."""
+    with (
+        torch.random.fork_rng(),
+        torch.no_grad(),
+        set_exploration_type(ExplorationType.DETERMINISTIC),
+    ):
+        torch.manual_seed(seed)
+        yield
+
+
+def evaluate(policy: Policy, env: EnvBase, seed: int, device: torch.device) -> dict[str, float]:
+    """Runs exactly one whole episode in every copy of `env`.
+
+    The copies are seeded anew, so the result depends on the policy and the seed alone. A copy that
+    has finished goes on until the last one has, but what it earns then is not counted: stopping at
+    the first end instead would cut the episodes of the others short.
+
+    Args:
+        policy: Maps a TensorDict with "observation" to one with "action".
+        env: Environment of batch size (num_episodes,); never the one that is trained on.
+        seed: First seed of the copies.
+        device: Device of the policy.
+
+    Returns:
+        `return_mean`, `return_std` (over episodes, not corrected for the sample), `num_episodes`
+        and `episode_length` (mean).
+    """
+    returns = torch.zeros(env.batch_size, dtype=torch.float64)
+    lengths = torch.zeros(env.batch_size, dtype=torch.int64)
+    alive = torch.ones(env.batch_size, dtype=torch.bool)
+    with evaluation_mode(seed):
+        env.set_seed(seed)
+        data = env.reset()
+        while alive.any():
+            data = policy(data.to(device)).to(env.device)
+            data, following = env.step_and_maybe_reset(data)
+            returns += data["next", "reward"].squeeze(-1).cpu() * alive
+            lengths += alive
+            alive &= ~data["next", "done"].squeeze(-1).cpu()
+            data = following
+    return {
+        "return_mean": returns.mean().item(),
+        "return_std": returns.std(correction=0).item(),
+        "num_episodes": float(returns.numel()),
+        "episode_length": lengths.double().mean().item(),
+    }
+
+
+def record_video(
+    policy: Policy, env_name: str, path: Path, seed: int, device: torch.device
+) -> None:
+    """Renders one whole episode of the deterministic policy to an MP4 file.
+
+    Raises:
+        RunError: If this machine cannot render.
+    """
+    # Has no effect where a screen is set up or the variable is given; must precede the rendering.
+    if not os.environ.get("DISPLAY"):
+        os.environ.setdefault("MUJOCO_GL", "egl")
+    try:
+        import imageio
+
+        env = make_env(env_name, render_mode="rgb_array")
+        observation, _ = env.reset(seed=seed)
+        images, done = [env.render()], False
+        with evaluation_mode(seed):
+            while not done:
+                data = TensorDict({"observation": torch.from_numpy(observation)}).to(device)
+                action = policy(data)["action"].cpu().numpy()
+                observation, _, terminated, truncated, _ = env.step(action)
+                images.append(env.render())
+                done = terminated or truncated
+        imageio.mimwrite(path, images, fps=env.metadata.get("render_fps", 30), macro_block_size=1)
+        env.close()
+    except Exception as error:  # every renderer and encoder has exceptions of its own
+        raise RunError(
+            f"the video could not be rendered with MUJOCO_GL={os.environ.get('MUJOCO_GL')!r}: "
+            f"{error}. Try MUJOCO_GL=egl (needs libEGL) or MUJOCO_GL=osmesa (needs libOSMesa), and "
+            "pip install 'imageio[ffmpeg]'. The trained agent is safe in the checkpoints."
+        ) from error

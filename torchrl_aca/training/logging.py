@@ -1,0 +1,206 @@
+"""Where numbers go: CSV tables always, another logger by choice, and the terminal."""
+
+from __future__ import annotations
+
+import csv
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.record.loggers import get_logger
+from tqdm import tqdm
+
+from torchrl_aca.training.errors import RunError
+
+
+class MetricMeans:
+    """Means of update metrics since the last row, each over the updates that reported it."""
+
+    def __init__(self) -> None:
+        """Starts empty."""
+        self.sums: dict[str, torch.Tensor] = {}
+        self.counts: dict[str, int] = {}
+
+    def add(self, metrics: TensorDictBase) -> None:
+        """Adds the scalars of one update, without waiting for the device."""
+        for name, value in metrics.items():
+            self.sums[name] = self.sums[name] + value if name in self.sums else value.clone()
+            self.counts[name] = self.counts.get(name, 0) + 1
+
+    def pop(self) -> dict[str, float]:
+        """Returns the means and starts again.
+
+        Raises:
+            RunError: If a mean is NaN or infinite.
+        """
+        means = {name: (total / self.counts[name]).item() for name, total in self.sums.items()}
+        self.sums, self.counts = {}, {}
+        for name, value in means.items():
+            if not torch.isfinite(torch.tensor(value)):
+                raise RunError(
+                    f"the metric {name!r} became {value}; expected a finite number. The training "
+                    "has diverged: lower optim.lr or the reward scale, and resume or start again."
+                )
+        return means
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns sums and counts."""
+        return {"sums": {k: v.cpu() for k, v in self.sums.items()}, "counts": dict(self.counts)}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restores what `state_dict` returned."""
+        self.sums, self.counts = dict(state_dict["sums"]), dict(state_dict["counts"])
+
+
+class CsvTable:
+    """A CSV file with one column per metric; columns may appear later than the first row."""
+
+    def __init__(self, path: Path, last_update: int | None = None) -> None:
+        """Opens a table.
+
+        Args:
+            path: The file.
+            last_update: Keep the rows of an earlier sitting up to this update; None starts anew.
+        """
+        self.path = path
+        self.columns: list[str] = []
+        self.rows: list[dict[str, Any]] = []
+        if last_update is not None and path.is_file():
+            with open(path, newline="") as file:
+                reader = csv.DictReader(file)
+                self.columns = list(reader.fieldnames or [])
+                self.rows = [row for row in reader if int(row["updates"]) <= last_update]
+            self._rewrite()
+
+    def append(self, row: Mapping[str, Any]) -> None:
+        """Adds a row and writes it at once."""
+        self.rows.append(dict(row))
+        if new := [name for name in row if name not in self.columns]:
+            self.columns += new
+            self._rewrite()
+        else:
+            with open(self.path, "a", newline="") as file:
+                csv.DictWriter(file, self.columns).writerow(row)
+
+    def _rewrite(self) -> None:
+        with open(self.path, "w", newline="") as file:
+            writer = csv.DictWriter(file, self.columns)
+            writer.writeheader()
+            writer.writerows(self.rows)
+
+
+class RunLogger:
+    """Writes metrics.csv and eval.csv, and the same numbers to wandb or tensorboard if asked."""
+
+    def __init__(
+        self,
+        run_dir: Path,
+        config: Mapping[str, Any],
+        last_update: int | None = None,
+    ) -> None:
+        """Opens the tables of a run and the second logger that `config["logger"]` names.
+
+        Raises:
+            RunError: If wandb is to be online and nobody is logged in.
+        """
+        settings = config["logger"]
+        self.tables = {
+            "metrics": CsvTable(run_dir / "metrics.csv", last_update),
+            "eval": CsvTable(run_dir / "eval.csv", last_update),
+        }
+        self.second = None
+        if settings["backend"] == "tensorboard":
+            self.second = get_logger("tensorboard", str(run_dir), "tensorboard")
+        elif settings["backend"] == "wandb":
+            offline = settings["wandb_mode"] == "offline"
+            self.second = get_logger(
+                "wandb",
+                str(run_dir),
+                run_dir.name,
+                wandb_kwargs={
+                    "project": settings["project"],
+                    # The run's name as id: a resumed run goes on in the same place.
+                    "id": run_dir.name,
+                    "offline": offline,
+                    "mode": settings["wandb_mode"],
+                    "config": dict(config),
+                    "log_env_packages": False,
+                },
+            )
+
+    def log(self, table: str, updates: int, frames: int, values: Mapping[str, float]) -> None:
+        """Adds a row to "metrics" or "eval"."""
+        self.tables[table].append({"updates": updates, "frames": frames, **values})
+        if self.second is not None:
+            numbers = {f"{table}/{name}": value for name, value in values.items()}
+            self.second.log_metrics({**numbers, f"{table}/frames": frames}, step=updates)
+
+    def close(self) -> None:
+        """Ends a wandb run; the CSV files need nothing."""
+        experiment = getattr(self.second, "experiment", None)
+        for end in ("finish", "close"):
+            if hasattr(experiment, end):
+                getattr(experiment, end)()
+                break
+
+
+def require_wandb_login(settings: Mapping[str, Any]) -> None:
+    """Checks, before any long work, that wandb can be reached without a question at the terminal.
+
+    Raises:
+        RunError: If wandb is missing or nobody is logged in.
+    """
+    if settings["backend"] != "wandb" or settings["wandb_mode"] == "offline":
+        return
+    try:
+        import wandb
+
+        logged_in = wandb.login(prompt=False)
+    except Exception as error:  # wandb raises its own kinds, or ImportError
+        raise RunError(f"logger.backend=wandb cannot be used: {error}.") from error
+    if not logged_in:
+        raise RunError(
+            "logger.backend=wandb: expected a wandb login, found none. Run `wandb login`, set "
+            "WANDB_API_KEY, or use logger.wandb_mode=offline."
+        )
+
+
+SHOWN = ("return", "loss", "per_second")
+
+
+class ProgressBar:
+    """A progress bar on a terminal; plain lines elsewhere."""
+
+    def __init__(self, total: int, initial: int) -> None:
+        """Counts updates from `initial` to `total`."""
+        self.total = total
+        self.bar = tqdm(total=total, initial=initial, unit="upd", disable=not sys.stdout.isatty())
+
+    def advance(self, updates: int, status: str = "") -> None:
+        """Moves the bar to `updates`; `status` stands behind it."""
+        self.bar.update(updates - self.bar.n)
+        if status:
+            self.bar.set_postfix_str(status, refresh=False)
+
+    def show(self, updates: int, frames: int, values: Mapping[str, float]) -> None:
+        """Shows the returns, losses and speeds of a row of metrics."""
+        shown = {name: value for name, value in values.items() if any(s in name for s in SHOWN)}
+        status = "  ".join(f"{name} {value:.4g}" for name, value in shown.items())
+        if self.bar.disable:
+            print(f"updates {updates}/{self.total}  frames {frames}  {status}", flush=True)
+        else:
+            self.advance(updates, status)
+
+    def write(self, message: str) -> None:
+        """Prints a line above the bar."""
+        if self.bar.disable:
+            print(message, flush=True)
+        else:
+            self.bar.write(message)
+
+    def close(self) -> None:
+        """Leaves the bar as it stands."""
+        self.bar.close()

@@ -1,0 +1,102 @@
+"""What a run leaves for the reader: versions, card and learning curve."""
+
+from __future__ import annotations
+
+import json
+import platform
+import subprocess
+from collections.abc import Mapping, Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import torch
+
+PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "mujoco", "numpy", "hydra-core")
+
+
+def versions() -> dict[str, Any]:
+    """Returns what a result depends on besides its configuration."""
+    found: dict[str, str | None] = {}
+    for package in PACKAGES:
+        try:
+            found[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            found[package] = None
+    return {
+        "python": platform.python_version(),
+        **found,
+        "commit": _commit(),
+        "platform": platform.platform(),
+        "cpu": _cpu_model(),
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        "threads": torch.get_num_threads(),
+    }
+
+
+def _commit() -> str | None:
+    command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    try:
+        here = Path(__file__).parent
+        result = subprocess.run(command, cwd=here, capture_output=True, text=True, timeout=10)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return result.stdout.strip() or None
+
+
+def _cpu_model() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return f"{names[0]} x {len(names)}" if names else platform.processor()
+
+
+def write_card(
+    run_dir: Path,
+    config: Mapping[str, Any],
+    evaluations: Sequence[Mapping[str, Any]],
+    seconds: float,
+) -> None:
+    """Writes card.md: what was run, on what, and what came out."""
+    last = evaluations[-1]
+    info = json.loads((run_dir / "versions.json").read_text())
+    rows = {
+        "environment": config["env"]["name"],
+        "algorithm": config["algo"]["name"],
+        "seed": config["seed"],
+        "updates": last["updates"],
+        "environment frames": f"{last['frames']} (warm-up included)",
+        "final return": f"{float(last['return_mean']):.1f} ± {float(last['return_std']):.1f} "
+        f"(mean ± std of {float(last['num_episodes']):.0f} episodes)",
+        "wall-clock time": f"{seconds / 60:.1f} min",
+        **{name: value for name, value in info.items() if value is not None},
+    }
+    table = "\n".join(f"| {name} | {value} |" for name, value in rows.items())
+    text = (
+        f"# {rows['algorithm']} on {rows['environment']}, seed {rows['seed']}\n\n"
+        f"| | |\n|---|---|\n{table}\n\n"
+        "Run again: the whole configuration is in `config.yaml`, the evaluations are in "
+        "`eval.csv`, the training metrics in `metrics.csv`.\n\n![learning curve](curve.png)\n"
+    )
+    (run_dir / "card.md").write_text(text)
+
+
+def plot_curve(run_dir: Path, title: str, evaluations: Sequence[Mapping[str, Any]]) -> None:
+    """Draws the evaluation return over updates and frames to curve.png."""
+    from matplotlib.figure import Figure
+
+    updates, frames, mean, std = (
+        [float(row[name]) for row in evaluations]
+        for name in ("updates", "frames", "return_mean", "return_std")
+    )
+    figure = Figure(figsize=(6, 4), layout="constrained")
+    axes = figure.subplots()
+    axes.plot(updates, mean, marker="o", markersize=3)
+    low = [m - s for m, s in zip(mean, std, strict=True)]
+    high = [m + s for m, s in zip(mean, std, strict=True)]
+    axes.fill_between(updates, low, high, alpha=0.2)
+    axes.set(title=title, xlabel=f"updates ({frames[-1]:.0f} frames at the end)", ylabel="return")
+    axes.grid(alpha=0.3)
+    figure.savefig(run_dir / "curve.png", dpi=120)

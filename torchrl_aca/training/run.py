@@ -1,0 +1,175 @@
+"""A run: its directory, its log, its checkpoints, and how it ends."""
+
+from __future__ import annotations
+
+import json
+import signal
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from types import FrameType
+
+from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDictBase
+
+from torchrl_aca.training.agent import Stateful
+from torchrl_aca.training.checkpoint import Counters, save_checkpoint
+from torchrl_aca.training.data import check_finite
+from torchrl_aca.training.errors import RunError
+from torchrl_aca.training.logging import ProgressBar, RunLogger
+from torchrl_aca.training.report import plot_curve, versions, write_card
+
+
+def make_run_dir(cfg: DictConfig) -> Path:
+    """Creates the directory of a new run and writes config.yaml and versions.json.
+
+    Raises:
+        RunError: If `run_dir` already holds a run.
+    """
+    stamp = time.strftime("%Y%m%d-%H%M%S")
+    name = f"{cfg.env.name.split(':')[-1]}-{cfg.algo.name}-s{cfg.seed}-{stamp}"
+    run_dir = Path(cfg.run_dir or Path("runs") / name)
+    if (run_dir / "config.yaml").exists():
+        raise RunError(
+            f"run_dir={run_dir} already holds a run; expected a new directory. Give another "
+            f"run_dir, or go on with resume={run_dir}."
+        )
+    run_dir.mkdir(parents=True, exist_ok=True)
+    (run_dir / "config.yaml").write_text(OmegaConf.to_yaml(cfg, resolve=True))
+    (run_dir / "versions.json").write_text(json.dumps(versions(), indent=2) + "\n")
+    return run_dir
+
+
+class Run:
+    """Keeps the books of a training loop; a context manager.
+
+    Attributes:
+        dir: The run directory.
+        counters: Updates, frames and seconds; the loop counts the first two.
+        stopping: Whether Ctrl-C or SIGTERM has arrived: leave the loop after this iteration.
+    """
+
+    def __init__(
+        self, cfg: DictConfig, parts: Mapping[str, Stateful], counters: Counters, resumed: bool
+    ) -> None:
+        """Opens a new run directory, or the one in `cfg.resume`.
+
+        Args:
+            cfg: The whole configuration.
+            parts: Everything that a checkpoint holds.
+            counters: One of the parts.
+            resumed: Whether the parts come from a checkpoint.
+        """
+        self.dir = Path(cfg.resume) if resumed else make_run_dir(cfg)
+        self.config = OmegaConf.to_container(cfg, resolve=True)
+        self.parts, self.counters = parts, counters
+        self._saved: int | None = None  # frames at the latest checkpoint of this sitting
+        self.logger = RunLogger(self.dir, self.config, counters.updates if resumed else None)
+        self.bar = ProgressBar(cfg.optim.total_updates, counters.updates)
+        self._signal = StopSignal()
+        self._lap = (time.perf_counter(), counters.updates, counters.frames)
+        self.bar.write(f"run directory: {self.dir}")
+
+    def __enter__(self) -> Run:
+        """Starts to listen for signals."""
+        self._signal.__enter__()
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        """Closes the log."""
+        self._signal.__exit__(*exc_info)
+        self.bar.close()
+        self.logger.close()
+
+    @property
+    def stopping(self) -> bool:
+        """Whether a signal asks to stop."""
+        return self._signal.received is not None
+
+    def check(self, data: TensorDictBase) -> None:
+        """Raises `RunError` for NaN in collected data, after a checkpoint without that data."""
+        try:
+            check_finite(data, self.config["env"]["name"], self.counters.frames)
+        except RunError as error:
+            # The environments cannot be trusted any more: the resumed run begins new episodes.
+            path = self.save(without=("env", "episodes"))
+            raise RunError(f"{error} What came before is in {path}.") from None
+
+    def log_metrics(self, values: Mapping[str, float]) -> None:
+        """Adds a row of training metrics, with the time and the speed."""
+        self._log("metrics", {**values, **self._speed()})
+
+    def log_evaluation(self, values: Mapping[str, float]) -> None:
+        """Adds a row of evaluation results."""
+        self._log("eval", values)
+
+    def show_progress(self) -> None:
+        """Moves the progress bar."""
+        self.bar.advance(self.counters.updates)
+
+    def _log(self, table: str, values: Mapping[str, float]) -> None:
+        updates, frames = self.counters.updates, self.counters.frames
+        self.logger.log(table, updates, frames, values)
+        self.bar.show(updates, frames, values)
+
+    def _speed(self) -> dict[str, float]:
+        then, updates, frames = self._lap
+        now = time.perf_counter()
+        self._lap = (now, self.counters.updates, self.counters.frames)
+        self.counters.seconds += now - then
+        return {
+            "seconds": self.counters.seconds,
+            "frames_per_second": (self.counters.frames - frames) / (now - then),
+            "updates_per_second": (self.counters.updates - updates) / (now - then),
+        }
+
+    def save(self, without: tuple[str, ...] = ()) -> Path:
+        """Writes a checkpoint of all parts but those named."""
+        parts = {name: part for name, part in self.parts.items() if name not in without}
+        keep_last = self.config["checkpoint"]["keep_last"]
+        updates = self.counters.updates
+        self._saved = self.counters.frames
+        return save_checkpoint(self.dir / "checkpoints", parts, self.config, updates, keep_last)
+
+    def finish(self) -> None:
+        """Writes the last checkpoint, the card and the curve, and says how it went."""
+        self._speed()
+        if self._saved != self.counters.frames:
+            self.save()
+        rows = self.logger.tables["eval"].rows
+        title = f"{self.config['algo']['name']} on {self.config['env']['name']}"
+        write_card(self.dir, self.config, rows, self.counters.seconds)
+        plot_curve(self.dir, title, rows)
+        if self._signal.received:
+            self.bar.write(
+                f"stopped by {self._signal.received} after {self.counters.updates} updates; "
+                f"go on with resume={self.dir}"
+            )
+        else:
+            before, after = (float(row["return_mean"]) for row in (rows[0], rows[-1]))
+            self.bar.write(f"mean evaluation return: before {before:.1f}, after {after:.1f}")
+
+
+class StopSignal:
+    """Turns the first Ctrl-C or SIGTERM into a wish to stop; a second one stops at once."""
+
+    SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+    def __init__(self) -> None:
+        """Does nothing until it is entered."""
+        self.received: str | None = None
+
+    def __enter__(self) -> StopSignal:
+        """Installs the handlers."""
+        self._previous = {number: signal.signal(number, self._handle) for number in self.SIGNALS}
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        """Puts the earlier handlers back."""
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        self.received = signal.Signals(number).name
+        for each, handler in self._previous.items():
+            signal.signal(each, handler)
