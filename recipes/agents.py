@@ -104,7 +104,7 @@ def make_aca(cfg: DictConfig, env: EnvBase, device: torch.device) -> Agent:
 
 
 def lr_factor(optim: DictConfig, step: int) -> float:
-    """Linear decay from `lr` to `lr_end` between two steps of the optimiser, as a factor of `lr`."""
+    """Returns the factor of `lr` after so many optimiser steps: linear decay to `lr_end`."""
     span = optim.lr_decay_end - optim.lr_decay_start
     progress = min(max((step - optim.lr_decay_start) / span, 0.0), 1.0)
     return 1 + progress * (optim.lr_end / optim.lr - 1)
@@ -135,7 +135,9 @@ def make_sac(cfg: DictConfig, env: EnvBase, device: torch.device) -> Agent:
         MLP(in_features=observation_dim + action_dim, out_features=1, **mlp),
         in_keys=["observation", "action"],
     )
-    loss = SACLoss(policy, critic, num_qvalue_nets=2, alpha_init=settings.alpha_init).to(device)
+    loss = SACLoss(
+        policy, critic, num_qvalue_nets=2, loss_function="l2", alpha_init=settings.alpha_init
+    ).to(device)
     loss.make_value_estimator(gamma=cfg.optim.gamma)
     target_update = SoftUpdate(loss, tau=cfg.optim.tau)
     optimizer = torch.optim.Adam(loss.parameters(), lr=cfg.optim.lr)

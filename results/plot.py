@@ -17,7 +17,7 @@ from omegaconf import OmegaConf
 
 
 def plot_run(axes: Axes, run_dir: Path) -> float:
-    """Draws mean +- std over episodes against updates; returns the warm-up free frames an update."""
+    """Draws mean +- std over episodes against updates; returns the frames of an update."""
     config = OmegaConf.load(run_dir / "config.yaml")
     with open(run_dir / "eval.csv", newline="") as file:
         rows = list(csv.DictReader(file))

@@ -43,8 +43,8 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         schedule: the diffusion's constants; its ``T`` is the length of the chain.
 
     Keyword Args:
-        spec: bounded action spec of one env (``env.action_spec_unbatched``), or a ``Composite`` that
-            holds it under the action's key. Default: actions are in [-1, 1].
+        spec: bounded action spec of one env (``env.action_spec_unbatched``), or a ``Composite``
+            that holds it under the action's key. Default: actions are in [-1, 1].
         action_dim: size ``A`` of the action, needed only without ``spec`` for a critic without an
             ``action_dim`` of its own.
         guidance_weight: ``w``. Default: 50.
@@ -54,10 +54,10 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         exploration_noise: standard deviation of the exploration noise at ``alpha = 1``, in critic
             units. Default: 0.1.
         alpha_init: initial ``alpha``. Default: 5.
-        clip_action: clip the action to the spec's bounds. Default: False; as in the official code,
-            exploration noise may leave the box, and the loss learns from such actions.
-        compile_step: run the denoising step through ``torch.compile``: 10 to 20 seconds at the first
-            call of each shape, about twice as fast afterwards. Default: False.
+        clip_action: clip the action to the spec's bounds. Default: False; as in the official
+            code, exploration noise may leave the box, and the loss learns from such actions.
+        compile_step: run the denoising step through ``torch.compile``: seconds of compilation at
+            the first call of each shape, faster steps afterwards. Default: False.
         in_keys: keys of the observations. Default: those of the critic.
         out_keys: the action's key.
 
@@ -98,8 +98,8 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         if num_candidates < 1 or guidance_weight < 0 or exploration_noise < 0 or alpha_init <= 0:
             raise ValueError(
                 "Expected num_candidates >= 1, guidance_weight >= 0, exploration_noise >= 0 and "
-                f"alpha_init > 0; got num_candidates={num_candidates}, guidance_weight="
-                f"{guidance_weight}, exploration_noise={exploration_noise}, alpha_init={alpha_init}."
+                f"alpha_init > 0; got {num_candidates=}, {guidance_weight=}, {exploration_noise=}, "
+                f"{alpha_init=}."
             )
         self.critic: NoiseLevelCriticBase = as_noise_level_critic(critic)
         if getattr(critic, "num_steps", schedule.num_steps) != schedule.num_steps:
@@ -120,19 +120,22 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
 
         anchor = next(self.critic.parameters())
         self.log_alpha = nn.Parameter(anchor.new_tensor(math.log(alpha_init)))
-        leaf = _action_spec(spec, self.out_keys[0], action_dim or getattr(critic, "action_dim", None))
+        leaf = _action_spec(
+            spec, self.out_keys[0], action_dim or getattr(critic, "action_dim", None)
+        )
         self.spec = Composite({self.out_keys[0]: leaf}).to(anchor.device)
         self.action_dim = leaf.shape[-1]
         low, high = torch.full(leaf.shape, -1.0), torch.full(leaf.shape, 1.0)
         if spec is not None:
             low, high = leaf.space.low, leaf.space.high
-        self.register_buffer("center", ((high + low) / 2).to(anchor), persistent=False)
-        self.register_buffer("half_range", ((high - low) / 2).to(anchor), persistent=False)
-        draws = torch.randn(
-            schedule.num_steps + 1, num_candidates, self.action_dim,
-            generator=torch.Generator().manual_seed(0),
-        )  # fmt: skip
-        self.register_buffer("fixed_noise", draws.to(anchor), persistent=False)
+        shape = (schedule.num_steps + 1, num_candidates, self.action_dim)
+        constants = {
+            "center": (high + low) / 2,
+            "half_range": (high - low) / 2,
+            "fixed_noise": torch.randn(shape, generator=torch.Generator().manual_seed(0)),
+        }
+        for name, value in constants.items():
+            self.register_buffer(name, value.to(anchor), persistent=False)
 
     # --- units ------------------------------------------------------------------------------------
 
@@ -159,10 +162,8 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
             All candidates in critic units, shape ``(N, *batch, A)``.
         """
         batch = noise.shape[2:-1]
-        features = self._encode(observation, batch)
-        return self._denoise(features, noise.flatten(2, -2) if batch else noise.unsqueeze(2)).reshape(
-            noise.shape[1:]
-        )
+        rows = noise.reshape(*noise.shape[:2], batch.numel(), noise.shape[-1])
+        return self._denoise(self._encode(observation, batch), rows).reshape(noise.shape[1:])
 
     def select(self, observation: Tensor | Sequence[Tensor], candidates: Tensor) -> Tensor:
         """The best candidate by the minimum over the critics at level 0.

@@ -1,9 +1,9 @@
-"""Noise-level critics ``Q(s, a_t, t)``: what the chain and the loss ask of one, and the paper's MLP."""
+"""Noise-level critics ``Q(s, a_t, t)``: what chain and loss ask of one, and the paper's MLP."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -71,8 +71,8 @@ class NoiseLevelCriticBase(TensorDictModuleBase):
     def action_gradient(self, features: Any, action: Tensor, noise_level: Tensor) -> Tensor:
         """Gradient of the sum of the critics with respect to the action, shape ``(*N, B, A)``.
 
-        The sum, because the official code guides with ``Q_1 + Q_2``. No graph is kept; it works under
-        ``no_grad``, ``inference_mode`` and ``torch.compile(fullgraph=True)``.
+        The sum, because the official code guides with ``Q_1 + Q_2``. No graph is kept; it works
+        under ``no_grad``, ``inference_mode`` and ``torch.compile(fullgraph=True)``.
         """
 
         def total(action: Tensor) -> Tensor:
@@ -97,7 +97,7 @@ class NoiseLevelCriticBase(TensorDictModuleBase):
 
 
 class _StackedLinear(nn.Module):
-    """``E`` independent linear layers as one batched product, ``(E, rows, in) -> (E, rows, out)``."""
+    """``E`` independent linear layers as one product, ``(E, rows, in) -> (E, rows, out)``."""
 
     def __init__(self, num_critics: int, num_in: int, num_out: int, **factory: Any) -> None:
         super().__init__()
@@ -192,8 +192,8 @@ class NoiseLevelCritic(NoiseLevelCriticBase):
         self.value = linear(widths[-1], 1)
 
     def encode(self, *observations: Tensor) -> tuple[Tensor, Tensor]:
-        """Shares of the first layer: of each state ``(E, B, H)``, of each level ``(E, levels, H)``."""
-        first = self.hidden[0]
+        """First layer: each state's share ``(E, B, H)`` and each level's ``(E, levels, H)``."""
+        first = self._first
         observation_weight, _, level_weight = self._first_weights()
         observation = observations[0].to(first.weight.dtype)
         num_levels = self.num_steps + self.first_level
@@ -207,25 +207,25 @@ class NoiseLevelCritic(NoiseLevelCriticBase):
     def evaluate(self, features: Any, action: Tensor, noise_level: Tensor) -> Tensor:
         """See :meth:`NoiseLevelCriticBase.evaluate`."""
         x = self.activation(self._first_layer(features, action, noise_level))
-        for layer in self.hidden[1:]:
+        for layer in self._others:
             x = self.activation(layer(x))
         return self.value(x).squeeze(-1).movedim(0, -1).reshape(*action.shape[:-1], -1)
 
     def action_gradient(self, features: Any, action: Tensor, noise_level: Tensor) -> Tensor:
         """See :meth:`NoiseLevelCriticBase.action_gradient`; the chain rule written out.
 
-        Forward, each layer keeps the slope of its activation; backward, the gradient is multiplied by
-        slope and transposed weight, layer by layer, down to the action's share of the first one.
+        Forward, each layer keeps the slope of its activation; backward, the gradient is multiplied
+        by slope and transposed weight, layer by layer, down to the action's share of the first.
         """
         with torch.no_grad():
             x = self._first_layer(features, action, noise_level)
             x, slope = F.activation_and_slope(self.activation, x)
             slopes = [slope]
-            for layer in self.hidden[1:]:
+            for layer in self._others:
                 x, slope = F.activation_and_slope(self.activation, layer(x))
                 slopes.append(slope)
             gradient = self.value.weight.mT
-            for layer, slope in zip(reversed(self.hidden[1:]), reversed(slopes[1:]), strict=True):
+            for layer, slope in zip(reversed(self._others), reversed(slopes[1:]), strict=True):
                 gradient = (gradient * slope) @ layer.weight.mT
             _, action_weight, _ = self._first_weights()
             return ((gradient * slopes[0]) @ action_weight.mT).sum(0).view(action.shape)
@@ -234,10 +234,18 @@ class NoiseLevelCritic(NoiseLevelCriticBase):
         """All dimensions of the observation but its last, whatever the TensorDict's own."""
         return observations[0].shape[:-1]
 
+    @property
+    def _first(self) -> _StackedLinear:
+        return cast(_StackedLinear, self.hidden[0])
+
+    @property
+    def _others(self) -> list[_StackedLinear]:
+        return cast("list[_StackedLinear]", list(self.hidden)[1:])
+
     def _first_weights(self) -> tuple[Tensor, ...]:
         """The first layer's weight, split by its inputs: observation, action, level features."""
         sizes = [self.observation_dim, self.action_dim, self.embedding_dim]
-        return self.hidden[0].weight.split(sizes, dim=1)
+        return self._first.weight.split(sizes, dim=1)
 
     def _first_layer(self, features: Any, action: Tensor, noise_level: Tensor) -> Tensor:
         """Pre-activation of the first layer, shape ``(E, rows, H)``."""

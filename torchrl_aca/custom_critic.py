@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
-import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from tensordict.utils import NestedKey
@@ -19,9 +18,10 @@ __all__ = ["CustomCritic", "as_noise_level_critic"]
 class CustomCritic(NoiseLevelCriticBase):
     """Any module that maps observations, action and noise level to ``E`` values, as a critic.
 
-    Where the module is a ``TensorDictSequential``, the parts that depend neither on the action nor on
-    the noise level (an image encoder, say) run once per state; the others run once per candidate and
-    denoising step. A plain ``nn.Module`` is called as ``module(observation, action, noise_level)``.
+    Where the module is a ``TensorDictSequential``, the parts that depend neither on the action nor
+    on the noise level (an image encoder, say) run once per state; the others run once per candidate
+    and denoising step. A plain ``nn.Module`` is called as
+    ``module(observation, action, noise_level)``.
 
     The module sees flat batches: observations of shape ``(rows, ...)``, actions ``(rows, A)`` in
     critic units, integer noise levels ``(rows,)``. Its output has shape ``(rows, E)``.
@@ -30,8 +30,9 @@ class CustomCritic(NoiseLevelCriticBase):
         module: the network. A module that ignores the noise level is a plain critic ``Q(s, a)``.
 
     Keyword Args:
-        observation_keys: keys of the observations. Default: those that the module reads and neither
-            writes itself nor knows as action or noise level; ``["observation"]`` for a plain module.
+        observation_keys: keys of the observations. Default: those that the module reads and
+            neither writes itself nor knows as action or noise level; ``["observation"]`` for a
+            plain module.
         action_key: default ``"action"``.
         noise_level_key: default ``"noise_level"``.
         value_key: default ``"state_action_value"``.
@@ -51,26 +52,28 @@ class CustomCritic(NoiseLevelCriticBase):
         value_key: NestedKey = "state_action_value",
         first_level: int = 1,
     ) -> None:
-        inner = module
-        if not isinstance(module, TensorDictModuleBase):
-            keys = [*(observation_keys or ["observation"]), action_key, noise_level_key]
-            inner = TensorDictModule(module, in_keys=keys, out_keys=[value_key])
-        if action_key not in inner.in_keys or value_key not in inner.out_keys:
+        row_keys = (action_key, noise_level_key)
+        if isinstance(module, TensorDictModuleBase):
+            inner = module
+        else:
+            in_keys = [*(observation_keys or ["observation"]), *row_keys]
+            inner = TensorDictModule(module, in_keys=in_keys, out_keys=[value_key])
+        in_keys, out_keys = list(inner.in_keys), list(inner.out_keys)
+        if action_key not in in_keys or value_key not in out_keys:
             raise ValueError(
-                f"A critic must read the action {action_key!r} and write the value {value_key!r}, but "
-                f"this one reads {list(inner.in_keys)} and writes {list(inner.out_keys)}. Rename its "
-                "keys, or pass action_key= and value_key= to CustomCritic."
+                f"A critic must read the action {action_key!r} and write the value {value_key!r}, "
+                f"but this one reads {in_keys} and writes {out_keys}. Rename its keys, or pass "
+                "action_key= and value_key= to CustomCritic."
             )
         if observation_keys is None:
-            row_keys = (action_key, noise_level_key)
-            observation_keys = [key for key in inner.in_keys if key not in row_keys]
+            observation_keys = [key for key in in_keys if key not in row_keys]
         super().__init__(observation_keys, action_key, noise_level_key, value_key, first_level)
         self.module = module
-        encoder, head = _split(inner, {action_key, noise_level_key})
-        # Both share `module`'s submodules: kept out of the module tree so that each is listed once.
+        encoder, head = _split(inner, set(row_keys))
+        # Both share `module`'s submodules: out of the module tree, so that each is listed once.
         self.__dict__["_encoder"] = encoder
         self.__dict__["_head"] = head
-        self._feature_keys = [key for key in head.in_keys if key not in (action_key, noise_level_key)]
+        self._feature_keys = [key for key in head.in_keys if key not in row_keys]
 
     def encode(self, *observations: Tensor) -> TensorDict:
         """What the head reads of ``B`` states, as a TensorDict of batch size ``(B,)``."""
@@ -107,12 +110,16 @@ def _split(
     module: TensorDictModuleBase, row_keys: set[NestedKey]
 ) -> tuple[TensorDictSequential, TensorDictSequential]:
     """Split a sequence into what depends on the state alone and what depends on ``row_keys``."""
-    parts = list(module.module) if isinstance(module, TensorDictSequential) else [module]
+    parts = (
+        list(cast(nn.ModuleList, module.module))
+        if isinstance(module, TensorDictSequential)
+        else [module]
+    )
     encoder, head = [], []
     for part in parts:
-        if row_keys.isdisjoint(part.in_keys):
+        if row_keys.isdisjoint(cast("list[NestedKey]", part.in_keys)):
             encoder.append(part)
         else:
             head.append(part)
-            row_keys = row_keys.union(part.out_keys)
+            row_keys = row_keys.union(cast("list[NestedKey]", part.out_keys))
     return TensorDictSequential(*encoder), TensorDictSequential(*head)

@@ -37,7 +37,8 @@ __all__ = [
 def cosine_betas(num_steps: int, offset: float = 0.008, beta_max: float = 0.999) -> Tensor:
     """Cosine schedule (Nichol & Dhariwal 2021, eq. 17); ACA's own with ``num_steps=20``.
 
-    ``beta_t = min(1 - g(t) / g(t - 1), beta_max)``, ``g(t) = cos^2((t/T + offset)/(1 + offset) pi/2)``.
+    ``beta_t = min(1 - g(t) / g(t - 1), beta_max)`` with
+    ``g(t) = cos^2((t / T + offset) / (1 + offset) pi / 2)``.
 
     Returns:
         Float64 tensor of shape ``(num_steps,)``; entry ``k - 1`` belongs to noise level ``k``.
@@ -73,7 +74,7 @@ def add_noise(action: Tensor, noise: Tensor, alpha_cumprod: Tensor) -> Tensor:
 
 
 def guided_noise(gradient: Tensor, guidance_weight: float | Tensor, sigma: Tensor) -> Tensor:
-    """Noise prediction of the critic (Definition 1): ``eps_hat = -w sigma_t grad_a Q(s, a_t, t)``."""
+    """The noise that the critic predicts, ``-w sigma_t grad_a Q(s, a_t, t)`` (Definition 1)."""
     return -guidance_weight * sigma * gradient
 
 
@@ -98,8 +99,8 @@ def posterior_mean(clean: Tensor, noisy_action: Tensor, coef1: Tensor, coef2: Te
 def sinusoidal_embedding(noise_level: Tensor, dim: int) -> Tensor:
     """Sinusoidal features of the raw noise level.
 
-    ``[sin(t f_j)]_j, [cos(t f_j)]_j``, ``f_j = 10000^(-2j / dim)``, ``j = 0..dim/2 - 1``, all divided
-    by ``sqrt(dim)`` as the official code does.
+    ``[sin(t f_j)]_j, [cos(t f_j)]_j`` with ``f_j = 10000^(-2j / dim)``, ``j = 0..dim/2 - 1``, all
+    divided by ``sqrt(dim)`` as the official code does.
 
     Args:
         noise_level: floating-point levels of any shape ``(*,)``.
@@ -131,7 +132,8 @@ def activation_and_slope(activation: nn.Module, x: Tensor) -> tuple[Tensor, Tens
     """``f(x)`` and ``f'(x)`` of an elementwise activation, in one forward-mode pass."""
     if isinstance(activation, nn.Mish):
         return mish_and_slope(x)
-    return torch.func.jvp(activation, (x,), (torch.ones_like(x),))
+    pair = torch.func.jvp(activation, (x,), (torch.ones_like(x),))
+    return pair[0], pair[1]
 
 
 def noise_level_target(clean_value: Tensor, kind: str) -> Tensor:

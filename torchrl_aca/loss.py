@@ -35,8 +35,8 @@ class ACALoss(LossModule):
     - :meth:`alpha_loss`: ``log_alpha * stop_grad(H(alpha) - H_target)``.
 
     :meth:`forward` gives all three, as the paper's summed objective. The official code instead
-    takes an optimiser step on the first, and at every second update another on the second, computed after
-    the first step: call the methods one by one for that.
+    takes an optimiser step on the first, and at every second update another on the second,
+    computed after the first step: call the methods one by one for that.
 
     The loss holds the very parameters of ``actor_network.critic`` and its ``log_alpha``, so actor,
     optimiser and collector never need synchronising in one process.
@@ -64,8 +64,8 @@ class ACALoss(LossModule):
             ``"auto"``.
 
     Random draws are taken from the input where it has them: ``noise_level`` (``1..T``, or
-    ``0..T-1`` with ``first_level=0``), ``noise`` (standard normal, shape of the action) and ``next_action``
-    (``a'_0`` in env units).
+    ``0..T-1`` with ``first_level=0``), ``noise`` (standard normal, shape of the action) and
+    ``next_action`` (``a'_0`` in env units).
 
     Raises:
         ValueError: on an unknown option, or a ``qvalue_network`` that is not the actor's critic.

@@ -15,9 +15,9 @@ __all__ = ["NoiseSchedule"]
 class NoiseSchedule(nn.Module):
     """Constants of a discrete diffusion process with ``T`` noise levels.
 
-    Every attribute listed below is a float64 buffer of shape ``(T,)``; row ``k - 1`` belongs to noise
-    level ``k`` (level 0 is the clean action and has no row). The constants follow device moves but
-    keep float64 when the module is cast, and are not part of the ``state_dict``.
+    Every attribute listed below is a float64 buffer of shape ``(T,)``; row ``k - 1`` belongs to
+    noise level ``k`` (level 0 is the clean action and has no row). The constants follow device
+    moves but keep float64 when the module is cast, and are not part of the ``state_dict``.
 
     Args:
         betas: variances ``beta_1..beta_T`` of the forward process, each in (0, 1).
@@ -150,10 +150,10 @@ class NoiseSchedule(nn.Module):
 
     def _apply(self, fn: Callable, recurse: bool = True) -> NoiseSchedule:
         """Follow device moves, ignore casts: the chain divides by numbers as small as 1e-3."""
-        exact = dict(self._buffers)
+        exact = dict(self.named_buffers())
         super()._apply(fn, recurse)
-        for name, value in exact.items():
-            self._buffers[name] = value.to(self._buffers[name].device)
+        for name, moved in list(self.named_buffers()):
+            self._buffers[name] = exact[name].to(moved.device)
         return self
 
 

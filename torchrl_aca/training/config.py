@@ -58,6 +58,17 @@ def validate(cfg: DictConfig, algorithms: Iterable[str]) -> None:
             fits = all(isinstance(cells, int) and cells > 0 for cells in section.num_cells)
             _require(fits, cfg, f"{name}.num_cells", "positive integers, one per hidden layer")
     _validate_sizes(cfg)
+    _validate_seeds(cfg)
+
+
+def _validate_seeds(cfg: DictConfig) -> None:
+    for key in ("seed", "eval.seed"):
+        value = OmegaConf.select(cfg, key)
+        fits = isinstance(value, int) and value >= 0
+        _require(fits, cfg, key, "an integer of at least 0")
+    first, last = cfg.seed, cfg.seed + cfg.collector.num_envs - 1
+    apart = cfg.eval.seed > last or cfg.eval.seed + cfg.eval.episodes <= first
+    _require(apart, cfg, "eval.seed", f"seeds apart from the training's {first} to {last}")
 
 
 def _validate_sizes(cfg: DictConfig) -> None:

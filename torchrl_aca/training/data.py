@@ -40,9 +40,11 @@ class BufferState:
 
     def state_dict(self) -> dict[str, Any]:
         """Returns the rows in storage order and the writer's position."""
-        rows = self.buffer[: len(self.buffer)].select(*TRANSITION_KEYS, strict=False)
-        # A view would be written with the whole, mostly empty storage behind it.
-        rows = rows.flatten_keys(".").clone()
+        size = len(self.buffer)
+        rows = self.buffer[:size].select(*TRANSITION_KEYS, strict=False).flatten_keys(".")
+        if size < self.buffer.storage.max_size:
+            # A view would be written with the whole, mostly empty storage behind it.
+            rows = rows.clone()
         return {"rows": rows.to_dict(), "writer": self.buffer.writer.state_dict()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -118,6 +120,6 @@ def check_finite(data: TensorDictBase, env_name: str, frames: int) -> None:
             name = key if isinstance(key, str) else ".".join(key)
             raise RunError(
                 f"{env_name} gave a NaN or infinite {name!r} after {frames} frames; expected "
-                "finite numbers. These transitions were not stored. Look at the environment's reward and "
-                "physics, or at the learning rate if the actions blew up first."
+                "finite numbers. These transitions were not stored. Look at the environment's reward "
+                "and physics, or at the learning rate if the actions blew up first."
             )

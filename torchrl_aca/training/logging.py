@@ -179,11 +179,10 @@ class ProgressBar:
         self.total = total
         self.bar = tqdm(total=total, initial=initial, unit="upd", disable=not sys.stdout.isatty())
 
-    def advance(self, updates: int, status: str = "") -> None:
-        """Moves the bar to `updates`; `status` stands behind it."""
+    def advance(self, updates: int) -> None:
+        """Moves the bar to `updates`."""
+        self.bar.set_description_str("train" if updates else "warm-up", refresh=False)
         self.bar.update(updates - self.bar.n)
-        if status:
-            self.bar.set_postfix_str(status, refresh=False)
 
     def show(self, updates: int, frames: int, values: Mapping[str, float]) -> None:
         """Shows the returns, losses and speeds of a row of metrics."""
@@ -192,7 +191,7 @@ class ProgressBar:
         if self.bar.disable:
             print(f"updates {updates}/{self.total}  frames {frames}  {status}", flush=True)
         else:
-            self.advance(updates, status)
+            self.bar.set_postfix_str(status, refresh=False)
 
     def write(self, message: str) -> None:
         """Prints a line above the bar."""
