@@ -49,7 +49,7 @@ def train(cfg: DictConfig, checkpoint: dict[str, Any] | None = None) -> Path:
     buffer = make_replay_buffer(cfg.buffer.capacity, cfg.optim.batch_size)
     episodes, means, counters = EpisodeTracker(cfg.collector.num_envs), MetricMeans(), Counters()
     parts = {
-        **agent.state,
+        **{f"agent.{name}": part for name, part in agent.state.items()},
         "buffer": BufferState(buffer),
         "episodes": episodes,
         "means": means,
@@ -88,7 +88,7 @@ def train(cfg: DictConfig, checkpoint: dict[str, Any] | None = None) -> Path:
             run.show_progress()
             if last or run.stopping:
                 break
-        run.finish()
+        run.finish(completed=last)
         if last:
             report_extras(cfg, run, agent, eval_env, device)
     collector.shutdown()

@@ -107,7 +107,8 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
                 f"The critic has num_steps={critic.num_steps} noise levels, the schedule "
                 f"{schedule.num_steps}. Build both with the same number."
             )
-        self.schedule = schedule
+        anchor = _first_parameter(self.critic)
+        self.schedule = schedule.to(anchor.device)
         self.guidance_weight = guidance_weight
         self.num_candidates = num_candidates
         self.normalize_gradient = normalize_gradient
@@ -118,11 +119,9 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         self.in_keys = list(in_keys) if in_keys is not None else list(self.critic.observation_keys)
         self.out_keys = list(out_keys)
 
-        anchor = next(self.critic.parameters())
         self.log_alpha = nn.Parameter(anchor.new_tensor(math.log(alpha_init)))
-        leaf = _action_spec(
-            spec, self.out_keys[0], action_dim or getattr(critic, "action_dim", None)
-        )
+        action_dim = action_dim or getattr(critic, "action_dim", None)
+        leaf = _action_spec(spec, self.out_keys[0], action_dim)
         self.spec = Composite({self.out_keys[0]: leaf}).to(anchor.device)
         self.action_dim = leaf.shape[-1]
         low, high = torch.full(leaf.shape, -1.0), torch.full(leaf.shape, 1.0)
@@ -145,7 +144,7 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
 
     def from_env(self, action: Tensor) -> Tensor:
         """The env's units to critic units, [-1, 1]."""
-        return (action - self.center) / self.half_range
+        return (action.to(self.center.dtype) - self.center) / self.half_range
 
     # --- the chain --------------------------------------------------------------------------------
 
@@ -246,7 +245,8 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
             ValueError: if ``num_candidates`` exceeds the actor's in a deterministic call.
         """
         batch = torch.Size(batch)
-        num_rows, num_chains = batch.numel(), num_candidates or self.num_candidates
+        num_rows = batch.numel()
+        num_chains = self.num_candidates if num_candidates is None else num_candidates
         features = self._encode(observation, batch)
         draws = self._draws(num_chains, num_rows, deterministic)
         action = self._select(features, self._denoise(features, draws[:-1]))
@@ -280,18 +280,40 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         return tensordict.set(self.out_keys[0], action)
 
 
+def _first_parameter(critic: nn.Module) -> nn.Parameter:
+    for parameter in critic.parameters():
+        return parameter
+    raise ValueError(
+        f"The critic must have parameters to train, got {type(critic).__name__} with none."
+    )
+
+
 def _action_spec(spec: TensorSpec | None, key: NestedKey, action_dim: int | None) -> TensorSpec:
     """The bounded vector spec of one env's action; an unbounded one where no spec was given."""
     if spec is None:
         if action_dim is None:
             raise ValueError("Pass spec= or action_dim=: the critic does not tell its action_dim.")
         return Unbounded(shape=(action_dim,))
-    leaf = spec[key] if isinstance(spec, Composite) else spec
-    if not isinstance(leaf, Bounded) or leaf.ndim != 1 or not leaf.dtype.is_floating_point:
+    if isinstance(spec, Composite):
+        if key not in spec.keys(True, True):
+            raise ValueError(
+                f"spec must hold the action's key {key!r}, got {list(spec.keys(True, True))}. "
+                "Pass out_keys=[...] to name the action, or the action's own spec."
+            )
+        spec = spec[key]
+    if not isinstance(spec, Bounded) or spec.ndim != 1 or not spec.dtype.is_floating_point:
         raise ValueError(
             "spec must be a bounded, continuous action spec of shape (A,), such as "
-            f"env.action_spec_unbatched; got {leaf}."
+            f"env.action_spec_unbatched; got {spec}."
         )
-    if not torch.isfinite(leaf.space.low + leaf.space.high).all():
-        raise ValueError(f"The bounds of the action spec must be finite, got {leaf.space}.")
-    return leaf
+    low, high = spec.space.low, spec.space.high
+    if not torch.isfinite(high - low).all() or not (high > low).all():
+        raise ValueError(
+            f"The bounds of the action spec must be finite with low < high, got {low} and {high}. "
+            "Wrap the env so that it declares the range that it uses."
+        )
+    if action_dim not in (None, spec.shape[-1]):
+        raise ValueError(
+            f"The critic has action_dim={action_dim}, the spec {spec.shape[-1]}: they must agree."
+        )
+    return spec

@@ -93,7 +93,7 @@ class NoiseLevelCriticBase(TensorDictModuleBase):
         rows = [o.reshape(-1, *o.shape[len(batch) :]) for o in observations]
         level = tensordict.get(self.noise_level_key).expand(batch).reshape(-1)
         value = self.evaluate(self.encode(*rows), action.reshape(-1, action.shape[-1]), level)
-        return tensordict.set(self.value_key, value.reshape(*batch, -1))
+        return tensordict.set(self.value_key, value.reshape(*batch, value.shape[-1]))
 
 
 class _StackedLinear(nn.Module):
@@ -209,7 +209,7 @@ class NoiseLevelCritic(NoiseLevelCriticBase):
         x = self.activation(self._first_layer(features, action, noise_level))
         for layer in self._others:
             x = self.activation(layer(x))
-        return self.value(x).squeeze(-1).movedim(0, -1).reshape(*action.shape[:-1], -1)
+        return self.value(x).squeeze(-1).movedim(0, -1).reshape(*action.shape[:-1], self.num_critics)
 
     def action_gradient(self, features: Any, action: Tensor, noise_level: Tensor) -> Tensor:
         """See :meth:`NoiseLevelCriticBase.action_gradient`; the chain rule written out.
@@ -255,4 +255,6 @@ class NoiseLevelCritic(NoiseLevelCriticBase):
         rows = action.reshape(-1, self.action_dim).expand(self.num_critics, -1, -1)
         product = rows @ action_weight
         num_states = share.shape[1]
-        return (product.unflatten(1, (-1, num_states)) + share.unsqueeze(1)).flatten(1, 2)
+        num_candidates = rows.shape[1] // max(num_states, 1)
+        product = product.unflatten(1, (num_candidates, num_states))
+        return (product + share.unsqueeze(1)).flatten(1, 2)

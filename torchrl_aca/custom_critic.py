@@ -94,7 +94,7 @@ class CustomCritic(NoiseLevelCriticBase):
                 f"A critic's output must have shape (rows, E), here ({rows.shape[0]}, E) with one "
                 f"column per critic; got {tuple(value.shape)}. A single critic has E = 1."
             )
-        return value.reshape(*batch, -1)
+        return value.reshape(*batch, value.shape[-1])
 
 
 def as_noise_level_critic(critic: nn.Module) -> NoiseLevelCriticBase:

@@ -259,7 +259,7 @@ class ACALoss(LossModule):
                 critic.evaluate(features, action.reshape(-1, action.shape[-1]), level.reshape(-1))
                 for action, level in queries
             ]
-        return [value.reshape(*batch, -1) for value in values]
+        return [value.reshape(*batch, value.shape[-1]) for value in values]
 
     @torch.no_grad()
     def _target_value(self, tensordict: TensorDictBase) -> Tensor:

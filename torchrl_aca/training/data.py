@@ -120,6 +120,6 @@ def check_finite(data: TensorDictBase, env_name: str, frames: int) -> None:
             name = key if isinstance(key, str) else ".".join(key)
             raise RunError(
                 f"{env_name} gave a NaN or infinite {name!r} after {frames} frames; expected "
-                "finite numbers. These transitions were not stored. Look at the environment's reward "
-                "and physics, or at the learning rate if the actions blew up first."
+                "finite numbers. These transitions were not stored. Look at the environment's "
+                "reward and physics, or at the learning rate if the actions blew up first."
             )

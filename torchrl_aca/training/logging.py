@@ -168,7 +168,13 @@ def require_wandb_login(settings: Mapping[str, Any]) -> None:
         )
 
 
-SHOWN = ("return", "loss", "per_second")
+SHOWN = ("per_second", "return", "loss")
+
+
+def _status(values: Mapping[str, float]) -> str:
+    # The speed first: what does not fit on a narrow terminal is cut off.
+    shown = [(name, values[name]) for part in SHOWN for name in values if part in name]
+    return "  ".join(f"{name} {value:.4g}" for name, value in shown)
 
 
 class ProgressBar:
@@ -184,14 +190,16 @@ class ProgressBar:
         self.bar.set_description_str("train" if updates else "warm-up", refresh=False)
         self.bar.update(updates - self.bar.n)
 
-    def show(self, updates: int, frames: int, values: Mapping[str, float]) -> None:
-        """Shows the returns, losses and speeds of a row of metrics."""
-        shown = {name: value for name, value in values.items() if any(s in name for s in SHOWN)}
-        status = "  ".join(f"{name} {value:.4g}" for name, value in shown.items())
+    def show_metrics(self, updates: int, frames: int, values: Mapping[str, float]) -> None:
+        """Shows a row of training metrics behind the bar, or as a line of its own."""
         if self.bar.disable:
-            print(f"updates {updates}/{self.total}  frames {frames}  {status}", flush=True)
+            self.show_evaluation(updates, frames, values)
         else:
-            self.bar.set_postfix_str(status, refresh=False)
+            self.bar.set_postfix_str(_status(values), refresh=False)
+
+    def show_evaluation(self, updates: int, frames: int, values: Mapping[str, float]) -> None:
+        """Shows a row of evaluation results as a line of its own."""
+        self.write(f"updates {updates}/{self.total}  frames {frames}  {_status(values)}")
 
     def write(self, message: str) -> None:
         """Prints a line above the bar."""

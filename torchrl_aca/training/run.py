@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,7 +22,7 @@ from torchrl_aca.training.report import plot_curve, versions, write_card
 
 
 def make_run_dir(cfg: DictConfig) -> Path:
-    """Creates the directory of a new run and writes config.yaml and versions.json.
+    """Creates the directory of a new run and writes versions.json.
 
     Raises:
         RunError: If `run_dir` already holds a run.
@@ -35,7 +36,6 @@ def make_run_dir(cfg: DictConfig) -> Path:
             f"run_dir, or go on with resume={run_dir}."
         )
     run_dir.mkdir(parents=True, exist_ok=True)
-    (run_dir / "config.yaml").write_text(OmegaConf.to_yaml(cfg, resolve=True))
     (run_dir / "versions.json").write_text(json.dumps(versions(), indent=2) + "\n")
     return run_dir
 
@@ -61,7 +61,9 @@ class Run:
             resumed: Whether the parts come from a checkpoint.
         """
         self.dir = Path(cfg.resume) if resumed else make_run_dir(cfg)
-        self.config = OmegaConf.to_container(cfg, resolve=True)
+        # The run as it is now: a resume may have changed the number of updates or the logger.
+        self.config = {**OmegaConf.to_container(cfg, resolve=True), "resume": None}
+        (self.dir / "config.yaml").write_text(OmegaConf.to_yaml(self.config))
         self.parts, self.counters = parts, counters
         self._saved: int | None = None  # frames at the latest checkpoint of this sitting
         self.logger = RunLogger(self.dir, self.config, counters.updates if resumed else None)
@@ -69,6 +71,8 @@ class Run:
         self._signal = StopSignal()
         self._lap = (time.perf_counter(), counters.updates, counters.frames)
         self.bar.write(f"run directory: {self.dir}")
+        if counters.frames < (warmup := cfg.collector.init_random_frames):
+            self.bar.write(f"the first {warmup} frames are random actions, without updates")
 
     def __enter__(self) -> Run:
         """Starts to listen for signals."""
@@ -97,20 +101,18 @@ class Run:
 
     def log_metrics(self, values: Mapping[str, float]) -> None:
         """Adds a row of training metrics, with the time and the speed."""
-        self._log("metrics", {**values, **self._speed()})
+        values = {**values, **self._speed()}
+        self.logger.log("metrics", self.counters.updates, self.counters.frames, values)
+        self.bar.show_metrics(self.counters.updates, self.counters.frames, values)
 
     def log_evaluation(self, values: Mapping[str, float]) -> None:
         """Adds a row of evaluation results."""
-        self._log("eval", values)
+        self.logger.log("eval", self.counters.updates, self.counters.frames, values)
+        self.bar.show_evaluation(self.counters.updates, self.counters.frames, values)
 
     def show_progress(self) -> None:
         """Moves the progress bar."""
         self.bar.advance(self.counters.updates)
-
-    def _log(self, table: str, values: Mapping[str, float]) -> None:
-        updates, frames = self.counters.updates, self.counters.frames
-        self.logger.log(table, updates, frames, values)
-        self.bar.show(updates, frames, values)
 
     def _speed(self) -> dict[str, float]:
         then, updates, frames = self._lap
@@ -131,8 +133,12 @@ class Run:
         self._saved = self.counters.frames
         return save_checkpoint(self.dir / "checkpoints", parts, self.config, updates, keep_last)
 
-    def finish(self) -> None:
-        """Writes the last checkpoint, the card and the curve, and says how it went."""
+    def finish(self, completed: bool) -> None:
+        """Writes the last checkpoint, the card and the curve, and says how it went.
+
+        Args:
+            completed: Whether all updates were made; False after a signal.
+        """
         self._speed()
         if self._saved != self.counters.frames:
             self.save()
@@ -140,14 +146,14 @@ class Run:
         title = f"{self.config['algo']['name']} on {self.config['env']['name']}"
         write_card(self.dir, self.config, rows, self.counters.seconds)
         plot_curve(self.dir, title, rows)
-        if self._signal.received:
-            self.bar.write(
-                f"stopped by {self._signal.received} after {self.counters.updates} updates; "
-                f"go on with resume={self.dir}"
-            )
-        else:
+        if completed:
             before, after = (float(row["return_mean"]) for row in (rows[0], rows[-1]))
             self.bar.write(f"mean evaluation return: before {before:.1f}, after {after:.1f}")
+        else:
+            self.bar.write(
+                f"stopped by {self._signal.received} after {self.counters.updates} updates; "
+                f"go on with: python {sys.argv[0]} resume={self.dir}"
+            )
 
 
 class StopSignal:

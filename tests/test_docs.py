@@ -1,0 +1,196 @@
+"""Promises of README and docs: code runs, links lead somewhere, commands and names are real."""
+
+from __future__ import annotations
+
+import csv
+import doctest
+import importlib
+import pkgutil
+import re
+import shlex
+from functools import cache
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDict
+from torchrl.objectives import SoftUpdate
+
+import torchrl_aca
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+CONFIGS = ROOT / "recipes" / "configs"
+PAGES = [ROOT / "README.md", *(p for p in sorted(DOCS.rglob("*.md")) if "_build" not in p.parts)]
+BLOCK = re.compile(r"(?:<!-- needs: (\S+) -->\n)?^```python(.*)\n((?:.*\n)*?)^```$", re.MULTILINE)
+COMMAND = re.compile(r"python recipes/online_mujoco\.py((?:\\\n|[^\n`#])*)")
+
+
+def name_of(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+def blocks(page: Path):
+    """(line, module that it needs or "", code) of each Python block."""
+    text = page.read_text()
+    for match in BLOCK.finditer(text):
+        needs, mark, code = match.groups()
+        assert not mark, f"{name_of(page)}: a block marked {mark!r} would not be run"
+        yield text[: match.start(3)].count("\n"), needs, code
+
+
+# --- code -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if any(blocks(p))], ids=name_of)
+def test_blocks_run_in_order(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    namespace = {"__name__": "__docs__"}
+    left_out = []
+    for line, needs, code in blocks(page):
+        if needs and not can_import(needs):
+            left_out.append(f"block at line {line} needs {needs}, which does not load here")
+            continue
+        # The line numbers of an error are those of the page.
+        exec(compile("\n" * line + code, name_of(page), "exec"), namespace)
+    if left_out:
+        pytest.skip("all other blocks ran; " + "; ".join(left_out))
+
+
+def can_import(module: str) -> bool:
+    try:
+        importlib.import_module(module)
+    except ImportError:
+        return False
+    return True
+
+
+def docstrings():
+    names = [m.name for m in pkgutil.walk_packages(torchrl_aca.__path__, "torchrl_aca.")]
+    finder = doctest.DocTestFinder(exclude_empty=True)
+    for module in map(importlib.import_module, names):
+        yield from (test for test in finder.find(module) if test.examples)
+
+
+@pytest.mark.parametrize("example", docstrings(), ids=lambda example: example.name)
+def test_docstring_examples(example):
+    draws = {"observation": torch.zeros(4, 3), "action": torch.zeros(4, 2)}
+    flags = {key: torch.zeros(4, 1, dtype=torch.bool) for key in ("done", "terminated")}
+    following = {"observation": torch.zeros(4, 3), "reward": torch.zeros(4, 1), **flags}
+    data = TensorDict({**draws, "next": following}, batch_size=[4])
+    public = {name: getattr(torchrl_aca, name) for name in torchrl_aca.__all__}
+    known = {"torch": torch, "TensorDict": TensorDict, "SoftUpdate": SoftUpdate, "data": data}
+    example.globs.update(**public, **known)
+    assert doctest.DocTestRunner().run(example).failed == 0
+
+
+# --- links, tests and commands that pages name ----------------------------------------------------
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_relative_links_lead_to_files(page):
+    text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+    links = re.findall(r"\]\(([^)\s]+)\)|src=\"([^\"]+)\"", text)
+    targets = [(a or b).split("#")[0] for a, b in links]
+    relative = [t for t in targets if t and not re.match(r"[a-z]+:", t)]
+    assert [t for t in relative if not (page.parent / t).exists()] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_named_tests_exist(page):
+    for file, test in re.findall(r"(tests/\w+\.py)::(\w+)", page.read_text()):
+        assert re.search(rf"^def {test}\(", (ROOT / file).read_text(), re.MULTILINE), (file, test)
+
+
+def commands():
+    for page in PAGES:
+        for match in COMMAND.finditer(page.read_text()):
+            yield page, shlex.split(match.group(1).replace("\\\n", " "))
+
+
+@pytest.mark.parametrize(
+    "arguments", [pytest.param(a, id=f"{name_of(p)}: {' '.join(a)}") for p, a in commands()]
+)
+def test_commands_compose(arguments):
+    name = "online_mujoco"
+    if "--config-name" in arguments:
+        at = arguments.index("--config-name")
+        name = arguments[at + 1]
+        del arguments[at : at + 2]
+    overrides = [a for a in arguments if "<" not in a and "..." not in a]
+    assert composed(*overrides, name=name).env.name
+
+
+# --- names ----------------------------------------------------------------------------------------
+
+
+@cache
+def composed(*overrides: str, name: str = "online_mujoco") -> DictConfig:
+    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+        return compose(name, overrides=list(overrides))
+
+
+def flat(node: DictConfig, prefix: str = "") -> dict[str, object]:
+    out = {}
+    for key, value in node.items():
+        name = f"{prefix}{key}"
+        out.update(flat(value, f"{name}.") if isinstance(value, DictConfig) else {name: value})
+    return out
+
+
+def table_rows(page: str) -> list[list[str]]:
+    lines = [line for line in (DOCS / page).read_text().splitlines() if line.startswith("| `")]
+    return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines]
+
+
+def test_config_page_has_every_key_with_its_default():
+    files = [*sorted((CONFIGS / "algo").glob("*.yaml"))]
+    assert [file.stem for file in files] == ["aca", "sac"]
+    aca, sac = flat(composed()), flat(composed("algo=sac"))
+    documented: dict[str, list[object]] = {}
+    for key, default, *_ in table_rows("config.md"):
+        documented.setdefault(key.strip("`"), []).append(yaml.safe_load(default.strip("`")))
+    assert documented.keys() == aca.keys() | sac.keys()
+    for key, values in documented.items():
+        configured = [plain(c[key]) for c in (aca, sac) if key in c]
+        assert all(value in configured for value in values), (key, values, configured)
+        assert configured[0] == values[0], (key, values, configured)
+
+
+def plain(value: object) -> object:
+    return OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
+
+
+@pytest.mark.parametrize("algorithm", ["aca", "sac"])
+def test_metrics_page_has_every_column(algorithm, tmp_path, monkeypatch):
+    documented = {row[0].strip("`") for row in table_rows("howto/metrics.md")}
+    monkeypatch.syspath_prepend(str(ROOT / "recipes"))
+    train = importlib.import_module("online_mujoco").train
+    cfg = composed(
+        f"algo={algorithm}",
+        "env=reacher",
+        f"run_dir={tmp_path / 'run'}",
+        f"{algorithm}.num_cells=[8]",
+        "collector.init_random_frames=250",
+        "optim.batch_size=8",
+        "optim.total_updates=2",
+        "logger.interval=1",
+        "eval.episodes=1",
+        *(["aca.num_candidates=2", "aca.num_target_candidates=2"] if algorithm == "aca" else []),
+    )
+    run_dir = train(cfg)
+    for table in ("metrics.csv", "eval.csv"):
+        with open(run_dir / table, newline="") as file:
+            columns = csv.DictReader(file).fieldnames
+        assert set(columns) <= documented, set(columns) - documented
+
+
+def test_metrics_page_has_every_entry_of_the_loss():
+    critic = torchrl_aca.NoiseLevelCritic(3, 2, num_cells=(8,))
+    actor = torchrl_aca.CriticGuidedDenoisingActor(critic, torchrl_aca.NoiseSchedule.cosine(20))
+    loss = torchrl_aca.ACALoss(actor)
+    documented = {row[0].strip("`") for row in table_rows("howto/metrics.md")}
+    assert {*loss.out_keys, loss.tensor_keys.priority} <= documented

@@ -1,0 +1,295 @@
+"""What the three losses compute: gradients, targets, draws, replay, learning."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from loss_cases import (
+    ACTION_DIM,
+    NUM_STEPS,
+    make_actor,
+    make_data,
+    make_loss,
+    set_constant,
+    total,
+)
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import nn
+from torchrl.data import Bounded, LazyTensorStorage, TensorDictPrioritizedReplayBuffer
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from torchrl_aca import (
+    ACALoss,
+    CriticGuidedDenoisingActor,
+    CustomCritic,
+    NoiseLevelCritic,
+    NoiseSchedule,
+)
+
+LOSSES = ("loss_qvalue", "loss_noise_level", "loss_alpha")
+
+# --- gradients ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_each_loss_reaches_only_its_own_parameters(name):
+    loss = make_loss()
+    loss(make_data(6))[name].backward()
+    of_alpha = name == "loss_alpha"
+    critic = list(loss.qvalue_network.parameters())
+    assert all((p.grad is None) is of_alpha for p in critic)
+    assert of_alpha or all(p.grad.abs().sum() > 0 for p in critic)
+    assert (loss.log_alpha.grad is not None) is of_alpha
+
+
+def test_the_summed_loss_reaches_every_parameter_and_no_target():
+    loss = make_loss()
+    total(loss(make_data(6))).backward()
+    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in loss.parameters())
+    targets = list(loss.target_qvalue_network_params.values(True, True))
+    assert targets and all(not p.requires_grad and p.grad is None for p in targets)
+
+
+# --- random draws ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["noise_level", "noise", "next_action"])
+def test_given_draws_are_used(name):
+    loss, data = make_loss(), make_data(6, draws=True)
+    out = loss(data)
+    torch.manual_seed(99)
+    torch.testing.assert_close(loss(data), out, rtol=0, atol=0)
+    data[name] = make_data(6, draws=True)[name]
+    changed = "loss_qvalue" if name == "next_action" else "loss_noise_level"
+    other = loss(data)
+    assert [key for key in LOSSES if not torch.equal(other[key], out[key])] == [changed]
+
+
+@pytest.mark.parametrize("mode", [ExplorationType.RANDOM, ExplorationType.DETERMINISTIC])
+def test_the_next_action_is_drawn_as_in_acting_whatever_the_exploration_type(mode):
+    loss, data = make_loss(), make_data(6)
+    torch.manual_seed(7)
+    with torch.no_grad():
+        data["next_action"] = loss.actor_network.sample(data["next", "observation"], (6,))
+    expected = loss.qvalue_loss(data)
+    del data["next_action"]
+    torch.manual_seed(7)
+    with set_exploration_type(mode):
+        torch.testing.assert_close(loss.qvalue_loss(data), expected)
+
+
+def test_num_target_candidates_is_the_number_of_chains_of_the_target(monkeypatch):
+    actor, data = make_actor(num_candidates=3), make_data(2)
+    seen, denoise = [], actor._denoise
+
+    def spy(features, noise):
+        seen.append(noise.shape)
+        return denoise(features, noise)
+
+    monkeypatch.setattr(actor, "_denoise", spy)
+    for given in (None, 1, 5):
+        make_loss(actor, num_target_candidates=given)(data)
+    assert [shape[1] for shape in seen] == [3, 1, 5]
+
+
+@pytest.mark.parametrize("first_level", [0, 1])
+def test_drawn_noise_levels_cover_exactly_the_noisy_levels(first_level, monkeypatch):
+    loss = make_loss(make_actor(first_level=first_level))
+    seen, values = [], loss._values
+    monkeypatch.setattr(
+        loss, "_values", lambda obs, *queries: seen.append(queries[-1][1]) or values(obs, *queries)
+    )
+    loss.noise_level_loss(make_data(500))
+    assert seen[0].unique().tolist() == list(range(first_level, first_level + NUM_STEPS))
+
+
+def test_the_same_seed_gives_the_same_losses():
+    data = make_data(6)
+    results = []
+    for seed in (5, 5, 6):
+        torch.manual_seed(0)
+        loss = make_loss()
+        torch.manual_seed(seed)
+        results.append(loss(data.clone()))
+    torch.testing.assert_close(results[0], results[1], rtol=0, atol=0)
+    assert results[0]["loss_qvalue"] != results[2]["loss_qvalue"]
+
+
+# --- the noise-level loss -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("first_level", [0, 1])
+@pytest.mark.parametrize("target", ["mean", "self"])
+def test_noise_level_loss_by_hand(target, first_level):
+    actor = make_actor(first_level=first_level)
+    loss, data = make_loss(actor, noise_level_target=target), make_data(6, draws=True)
+    data["noise_level"] += first_level - 1
+    steps = data["noise_level"] - first_level + 1
+    signal = actor.schedule.alphas_cumprod[steps - 1].float().unsqueeze(-1)
+    noisy = signal.sqrt() * data["action"] + (1 - signal).sqrt() * data["noise"]
+    with torch.no_grad():
+        clean = actor.critic(data["observation"], data["action"], torch.zeros(6, dtype=torch.long))
+        value = actor.critic(data["observation"], noisy, data["noise_level"])
+    goal = clean if target == "self" else clean.mean(-1, keepdim=True)
+    expected = (value - goal).square().sum(-1).mean()
+    torch.testing.assert_close(loss.noise_level_loss(data)["loss_noise_level"], expected)
+
+
+# --- units, shapes, critics -----------------------------------------------------------------------
+
+
+def test_actions_in_the_units_of_the_env_give_the_same_losses():
+    plain = make_loss()
+    low, high = torch.tensor([-2.0, 0.0]), torch.tensor([2.0, 1.0])
+    actor = make_actor(plain.actor_network.critic, spec=Bounded(low, high))
+    loss, data = make_loss(actor), make_data(6, draws=True)
+    loss.target_qvalue_network_params.data.update_(plain.target_qvalue_network_params.data)
+    expected = plain(data)
+    for key in ("action", "next_action"):
+        data[key] = low + (data[key] + 1) / 2 * (high - low)
+    torch.testing.assert_close(loss(data), expected)
+
+
+@pytest.mark.parametrize("batch", [(), (1,), (5,), (2, 3), (2, 1, 3)])
+def test_losses_do_not_depend_on_how_rows_are_arranged(batch):
+    loss, data = make_loss(), make_data(*batch, draws=True)
+    flat = data.reshape(-1)
+    torch.testing.assert_close(loss(data), loss(flat))
+    assert data["td_error"].shape == batch
+    torch.testing.assert_close(data["td_error"].reshape(-1), flat["td_error"])
+    loss.reduction = "none"
+    assert loss.qvalue_loss(data)["loss_qvalue"].shape == batch
+
+
+@pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
+def test_drawn_losses_of_any_batch_shape_are_finite(batch):
+    losses = make_loss()(make_data(*batch))
+    assert all(value.isfinite().all() for value in losses.values())
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [["observation", ("next", "observation")], [("next", "reward")]],
+    ids=["observation", "reward"],
+)
+def test_float64_observations_and_rewards_are_taken_by_a_float32_critic(keys):
+    loss, data = make_loss(), make_data(6, draws=True)
+    expected = loss(data)
+    for key in keys:
+        data[key] = data[key].double()
+    out = loss(data)
+    torch.testing.assert_close(out, expected, check_dtype=False)
+    total(out).backward()
+
+
+class PixelStateHead(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.net = nn.Sequential(nn.Linear(8 + 3 + 2 + 1, 16), nn.Mish(), nn.Linear(16, 2))
+
+    def forward(self, hidden, state, action, noise_level):
+        return self.net(torch.cat([hidden, state, action, noise_level.unsqueeze(-1)], -1))
+
+
+def test_a_critic_of_pixels_and_state_is_trained_and_encodes_each_state_once():
+    encoder = nn.Sequential(nn.Conv2d(1, 4, 3, stride=2), nn.Mish(), nn.Flatten(), nn.Linear(36, 8))
+    rows = []
+    encoder.register_forward_hook(lambda module, args, output: rows.append(len(output)))
+    head_keys = ["hidden", "state", "action", "noise_level"]
+    module = TensorDictSequential(
+        TensorDictModule(encoder, ["pixels"], ["hidden"]),
+        TensorDictModule(PixelStateHead(), head_keys, ["state_action_value"]),
+    )
+    actor = make_actor(CustomCritic(module), action_dim=ACTION_DIM, num_candidates=5)
+    loss, data = make_loss(actor), make_data(6)
+    for part in (data, data["next"]):
+        part["pixels"] = torch.randn(6, 1, 8, 8)
+        part["state"] = part.pop("observation")
+    out = loss.qvalue_loss(data)
+    assert rows == [6, 6, 6]  # s; s' by the online critic, which samples, and by the target
+    rows.clear()
+    out.update(loss.noise_level_loss(data))
+    assert rows == [6]
+    total(out).backward()
+    assert all(p.grad.abs().sum() > 0 for p in module.parameters())
+    assert set(loss.in_keys) >= {"pixels", "state", ("next", "pixels"), ("next", "state")}
+
+
+# --- prioritised replay ---------------------------------------------------------------------------
+
+
+def test_importance_weights_give_the_weighted_mean():
+    loss, data = make_loss(reduction="none"), make_data(6, draws=True)
+    rows = loss(data)
+    weights = torch.rand(6)
+    data["priority_weight"] = weights
+    loss.reduction = "mean"
+    weighted = loss(data)
+    for key in ("loss_qvalue", "loss_noise_level"):
+        torch.testing.assert_close(weighted[key], (rows[key] * weights).sum() / weights.sum())
+    loss.use_prioritized_weights = False
+    torch.testing.assert_close(loss(data)["loss_qvalue"], rows["loss_qvalue"].mean())
+
+
+def test_prioritised_replay_end_to_end():
+    # The wheels of TorchRL 0.14 are built for torch 2.14: with an older torch they have no trees.
+    pytest.importorskip(
+        "torchrl._torchrl",
+        reason="the binary extension of TorchRL, which prioritised samplers need, does not load",
+        exc_type=ImportError,
+    )
+    buffer = TensorDictPrioritizedReplayBuffer(
+        alpha=0.7, beta=0.9, storage=LazyTensorStorage(40), batch_size=20, priority_key="td_error"
+    )
+    buffer.extend(make_data(40))
+    loss = make_loss()
+    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
+    sample = buffer.sample()
+    assert sample["priority_weight"].unique().numel() == 1
+    for _ in range(4):
+        losses = loss(sample)
+        assert sample["td_error"].shape == (20,) and (sample["td_error"] > 0).all()
+        buffer.update_tensordict_priority(sample)
+        total(losses).backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        assert all(losses[key].isfinite() for key in LOSSES)
+        sample = buffer.sample()
+    assert sample["priority_weight"].unique().numel() > 1
+
+
+def test_td_error_is_the_largest_absolute_error_of_the_critics():
+    loss = make_loss(reward_scale=1.0)
+    set_constant(loss, online=0.0, target=0.0)
+    bias = loss.qvalue_network_params["value", "bias"]
+    bias.data.copy_(torch.tensor([0.5, 3.0]).view_as(bias))
+    data = make_data(2)
+    data["next", "reward"] = torch.tensor([[1.0], [-1.0]])
+    loss.qvalue_loss(data)
+    torch.testing.assert_close(data["td_error"], torch.tensor([2.0, 4.0]))
+    assert not data["td_error"].requires_grad
+
+
+# --- learning -------------------------------------------------------------------------------------
+
+
+def test_the_actor_learns_the_best_arm_of_a_bandit():
+    critic = NoiseLevelCritic(1, 1, num_steps=8, num_cells=(32, 32))
+    actor = CriticGuidedDenoisingActor(critic, NoiseSchedule.cosine(8), num_candidates=32)
+    loss = ACALoss(actor, num_target_candidates=1, reward_scale=1.0, delay_qvalue=False)
+    optimizer = torch.optim.Adam(critic.parameters(), lr=3e-3)
+    flag = torch.ones(64, 1, dtype=torch.bool)
+    observation = torch.zeros(64, 1)
+    for _ in range(400):
+        action = torch.rand(64, 1) * 2 - 1
+        following = {"observation": observation, "reward": -(action - 0.5).square()}
+        data = {"observation": observation, "action": action}
+        data["next"] = {**following, "done": flag, "terminated": flag}
+        losses = loss(TensorDict(data, batch_size=[64]))
+        optimizer.zero_grad()
+        (losses["loss_qvalue"] + losses["loss_noise_level"]).backward()
+        optimizer.step()
+    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+        chosen = actor(observation=torch.zeros(1))
+    assert chosen.item() == pytest.approx(0.5, abs=0.1)

@@ -1,0 +1,375 @@
+"""The online recipe, run as users run it, with tiny sizes."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+
+from torchrl_aca.training.checkpoint import list_checkpoints
+from torchrl_aca.training.config import resumed_config
+from torchrl_aca.training.envs import make_env
+from torchrl_aca.training.errors import RunError
+
+ROOT = Path(__file__).parents[1]
+SCRIPT = ROOT / "recipes" / "online_mujoco.py"
+CONFIGS = ROOT / "recipes" / "configs"
+TINY = [
+    "algo=sac",
+    "env=hopper",
+    "num_threads=1",
+    "sac.num_cells=[16,16]",
+    "collector.init_random_frames=200",
+    "buffer.capacity=300",
+    "optim.batch_size=16",
+    "optim.total_updates=60",
+    "eval.interval=30",
+    "eval.episodes=2",
+    "checkpoint.interval=25",
+    "logger.interval=10",
+]
+
+
+def start(*arguments: str, cwd: Path) -> subprocess.Popen:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    return subprocess.Popen(
+        [sys.executable, str(SCRIPT), *arguments],
+        cwd=cwd,
+        env=environment,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+
+
+def run(*arguments: str, cwd: Path) -> tuple[int, str, str]:
+    process = start(*arguments, cwd=cwd)
+    output, errors = process.communicate(timeout=120)
+    return process.returncode, output, errors
+
+
+def composed(*overrides: str, name: str = "online_mujoco"):
+    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+        return compose(name, overrides=list(overrides))
+
+
+@pytest.fixture(scope="module")
+def train():
+    """The recipe's own `train`, for what needs no process of its own."""
+    sys.path.insert(0, str(SCRIPT.parent))
+    try:
+        from online_mujoco import train as function
+    finally:
+        sys.path.remove(str(SCRIPT.parent))
+    return function
+
+
+@pytest.fixture(scope="module")
+def unbroken(tmp_path_factory) -> Path:
+    cwd = tmp_path_factory.mktemp("unbroken")
+    code, output, errors = run(*TINY, cwd=cwd)
+    assert code == 0, errors
+    (run_dir,) = (cwd / "runs").iterdir()
+    (cwd / "output.txt").write_text(output)
+    return run_dir
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def without_time(path: Path) -> list[dict[str, str]]:
+    return [{k: v for k, v in row.items() if "second" not in k} for row in rows_of(path)]
+
+
+def leaves(value, path=""):
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            yield from leaves(inner, f"{path}/{key}")
+    elif isinstance(value, list | tuple):
+        for index, inner in enumerate(value):
+            yield from leaves(inner, f"{path}/{index}")
+    else:
+        yield path, value
+
+
+def checkpoint_leaves(run_dir: Path) -> dict[str, object]:
+    content = torch.load(list_checkpoints(run_dir / "checkpoints")[-1], weights_only=True)
+    return dict(leaves(content["parts"]))
+
+
+def assert_same_state(first: Path, second: Path) -> None:
+    one, two = checkpoint_leaves(first), checkpoint_leaves(second)
+    assert one.keys() == two.keys()
+    for key in one.keys() - {"/counters/seconds"}:
+        if isinstance(one[key], torch.Tensor):
+            assert torch.equal(one[key], two[key]), key
+        else:
+            assert one[key] == two[key], key
+
+
+def test_run_directory(unbroken):
+    names = {path.name for path in unbroken.iterdir()}
+    assert re.fullmatch(r"Hopper-v4-sac-s0-\d{8}-\d{6}", unbroken.name)
+    assert names == {
+        "config.yaml",
+        "versions.json",
+        "metrics.csv",
+        "eval.csv",
+        "checkpoints",
+        "card.md",
+        "curve.png",
+    }
+    assert [path.name for path in list_checkpoints(unbroken / "checkpoints")] == [
+        "checkpoint_0000000050.pt",
+        "checkpoint_0000000060.pt",
+    ]
+    assert OmegaConf.load(unbroken / "config.yaml").optim.lr == 3e-4
+    versions = json.loads((unbroken / "versions.json").read_text())
+    assert versions["torch"] == torch.__version__ and versions["threads"] == 1
+    assert "Hopper-v4" in (unbroken / "card.md").read_text()
+
+
+def test_tables_count_updates_and_frames(unbroken):
+    metrics, evaluations = rows_of(unbroken / "metrics.csv"), rows_of(unbroken / "eval.csv")
+    assert [int(row["updates"]) for row in metrics] == [10, 20, 30, 40, 50, 60]
+    assert [int(row["frames"]) for row in metrics] == [250, 300, 350, 400, 450, 500]
+    assert {"loss_qvalue", "train_return", "frames_per_second"} <= metrics[0].keys()
+    assert [int(row["updates"]) for row in evaluations] == [0, 30, 60]
+    assert list(evaluations[0]) == [
+        "updates",
+        "frames",
+        "return_mean",
+        "return_std",
+        "num_episodes",
+        "episode_length",
+    ]
+
+
+def test_output_says_before_and_after_and_leaves_nothing_else(unbroken):
+    output = (unbroken.parents[1] / "output.txt").read_text()
+    assert re.search(r"mean evaluation return: before [\d.]+, after [\d.]+", output)
+    assert "updates 10/60  frames 250" in output
+    assert {path.name for path in unbroken.parents[1].iterdir()} == {"runs", "output.txt"}
+
+
+def test_stop_and_resume_equals_never_stopping(unbroken, tmp_path):
+    code, _, errors = run(*TINY, "optim.total_updates=34", "run_dir=here", cwd=tmp_path)
+    assert code == 0, errors
+    code, _, errors = run("resume=here", "optim.total_updates=60", cwd=tmp_path)
+    assert code == 0, errors
+    assert_same_state(unbroken, tmp_path / "here")
+    assert without_time(unbroken / "metrics.csv") == without_time(tmp_path / "here" / "metrics.csv")
+    # The shorter run also evaluated at its own end.
+    evaluations = rows_of(tmp_path / "here" / "eval.csv")
+    assert [row for row in evaluations if row["updates"] != "34"] == rows_of(unbroken / "eval.csv")
+
+
+def test_ctrl_c_leaves_a_checkpoint_that_resumes(unbroken, tmp_path):
+    arguments = [*TINY, "optim.total_updates=100000", "run_dir=here", "checkpoint.interval=100000"]
+    process = start(*arguments, cwd=tmp_path)
+    deadline = time.time() + 60
+    while not (tmp_path / "here" / "metrics.csv").exists() and time.time() < deadline:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    output, errors = process.communicate(timeout=60)
+    assert process.returncode == 0, errors
+    assert "Traceback" not in errors
+    stopped = int(re.search(r"stopped by SIGINT after (\d+) updates", output)[1])
+    assert f"python {SCRIPT} resume=here" in output
+    assert OmegaConf.load(tmp_path / "here" / "config.yaml").optim.total_updates == 100000
+    code, output, errors = run("resume=here", f"optim.total_updates={stopped + 5}", cwd=tmp_path)
+    assert code == 0, errors
+    assert int(rows_of(tmp_path / "here" / "eval.csv")[-1]["updates"]) == stopped + 5
+
+
+def test_mistakes_are_told_in_one_message(tmp_path):
+    code, _, errors = run("env.name=CartPole-v1", *TINY, cwd=tmp_path)
+    assert code == 1 and errors.startswith("error: CartPole-v1 has the action space Discrete(2)")
+    assert "Traceback" not in errors
+    assert not (tmp_path / "runs").exists()
+    with pytest.raises(HydraException, match="batch_sise"):
+        composed("optim.batch_sise=3")
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["algo.name=dqn"], "algo.name='dqn'.*'sac'"),
+        (["env.name=Nowhere-v0"], "Nowhere-v0.*cannot be made"),
+        (["optim.batch_size=0"], "optim.batch_size=0: expected a positive integer"),
+        (["sac.num_cells=[0]"], "sac.num_cells.*positive integers"),
+        (["buffer.capacity=8"], "at least optim.batch_size"),
+        (["device=cuda:99"], "device=cuda:99"),
+    ],
+)
+def test_bad_configurations_are_refused_before_any_work(train, tmp_path, overrides, message):
+    cfg = composed(*TINY, f"run_dir={tmp_path / 'here'}", *overrides)
+    with pytest.raises(RunError, match=message):
+        train(cfg)
+    assert not (tmp_path / "here").exists()
+
+
+def test_wandb_without_login_is_refused(train, tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("NETRC", str(tmp_path / "netrc"))
+    monkeypatch.delenv("WANDB_API_KEY", raising=False)
+    cfg = composed(*TINY, f"run_dir={tmp_path / 'here'}", "logger.backend=wandb")
+    with pytest.raises(RunError, match="wandb"):
+        train(cfg)
+    assert not (tmp_path / "here").exists()
+
+
+def test_a_used_run_directory_is_refused(train, unbroken):
+    with pytest.raises(RunError, match="already holds a run"):
+        train(composed(*TINY, f"run_dir={unbroken}"))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (
+            ["sac.num_cells=[32]"],
+            r"sac.num_cells=\[32\].*run to resume has sac.num_cells=\[16, 16\]",
+        ),
+        (["env=ant"], "env.name=Ant-v4.*run to resume has env.name=Hopper-v4"),
+        (["seed=4"], "seed=4.*run to resume has seed=0"),
+        (["optim.total_updates=60"], "already has 60 updates"),
+    ],
+)
+def test_a_resume_that_changes_the_run_is_refused(unbroken, overrides, message):
+    cfg = composed("algo=sac", f"resume={unbroken}", *overrides)
+    with pytest.raises(RunError, match=message):
+        resumed_config(cfg, overrides)
+
+
+def test_a_resume_with_an_edited_config_or_from_nowhere_is_refused(unbroken, tmp_path):
+    cfg = composed("algo=sac", f"resume={tmp_path}")
+    with pytest.raises(RunError, match="found no config.yaml"):
+        resumed_config(cfg, [])
+    stored = OmegaConf.load(unbroken / "config.yaml")
+    stored.sac.num_cells = [8]
+    OmegaConf.save(stored, tmp_path / "config.yaml")
+    with pytest.raises(RunError, match="found none"):
+        resumed_config(cfg, [])
+    (tmp_path / "checkpoints").symlink_to(unbroken / "checkpoints")
+    with pytest.raises(RunError, match=r"config.yaml has sac.num_cells=\[8\]"):
+        resumed_config(cfg, [])
+
+
+def test_total_updates_and_logger_may_change_on_resume(unbroken):
+    typed = ["optim.total_updates=99", "logger.backend=none", f"resume={unbroken}"]
+    cfg, checkpoint = resumed_config(composed("algo=sac", *typed), typed)
+    assert cfg.optim.total_updates == 99 and cfg.logger.backend == "none"
+    assert cfg.env.name == "Hopper-v4" and checkpoint["parts"]["counters"]["updates"] == 60
+
+
+class Failing(gym.Env):
+    """Gives a NaN reward at its 100th step."""
+
+    observation_space = gym.spaces.Box(-1, 1, (3,))
+    action_space = gym.spaces.Box(-2, 2, (2,))
+    steps = 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(3, np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        reward = float("nan") if self.steps == 100 else 1.0
+        return np.zeros(3, np.float32), reward, self.steps % 10 == 0, False, {}
+
+
+def test_nan_rewards_stop_the_run_with_a_checkpoint_that_resumes(train, tmp_path):
+    gym.register("Failing-v0", Failing)
+    try:
+        run_dir = tmp_path / "here"
+        cfg = composed(*TINY, "env.name=Failing-v0", f"run_dir={run_dir}")
+        with pytest.raises(RunError, match=r"Failing-v0.*next.reward.*after 495 frames.*0059.pt"):
+            train(cfg)
+        assert len(checkpoint_leaves(run_dir)) > 50
+        typed = [f"resume={run_dir}"]
+        train(*resumed_config(composed("algo=sac", *typed), typed))
+        assert rows_of(run_dir / "eval.csv")[-1]["updates"] == "60"
+    finally:
+        del gym.registry["Failing-v0"]
+
+
+def test_updates_per_frame_are_exact(train):
+    updates_due = sys.modules["online_mujoco"].updates_due
+    cfg = composed("collector.init_random_frames=1000")
+    for ratio, frames, expected in [
+        (0.2, 1000, 0),
+        (0.2, 1005, 1),
+        (0.2, 1000 + 5 * 10**6, 10**6),
+        (0.29, 1100, 29),  # 0.29 * 100 is 28.999... in floating point
+        (1, 1005, 5),
+        (0.2, 500, 0),
+    ]:
+        cfg.optim.utd_ratio = ratio
+        assert updates_due(cfg, frames) == expected
+
+
+def test_wandb_offline(tmp_path):
+    overrides = ["run_dir=here", "logger.backend=wandb", "logger.wandb_mode=offline"]
+    code, _, errors = run(*TINY, *overrides, cwd=tmp_path)
+    assert code == 0, errors
+    (path,) = (tmp_path / "here").glob("wandb/offline-run-*/*.wandb")
+    assert b"metrics/loss_qvalue" in path.read_bytes()
+    assert len(rows_of(tmp_path / "here" / "metrics.csv")) == 6
+
+
+def test_tensorboard_and_video(train, tmp_path):
+    run_dir = tmp_path / "here"
+    overrides = [f"run_dir={run_dir}", "logger.backend=tensorboard", "video.enabled=true"]
+    try:
+        train(composed(*TINY, *overrides))
+        assert (run_dir / "video.mp4").stat().st_size > 1000
+    except RunError as error:
+        if "could not be rendered" not in str(error):
+            raise
+        pytest.skip(f"the video needs OpenGL and imageio: {error}")
+    finally:
+        (path,) = (run_dir / "tensorboard").glob("events.out*")
+        assert b"metrics/loss_qvalue" in path.read_bytes()
+
+
+def test_every_configuration_composes_and_its_environment_is_built():
+    tasks = sorted(path.stem for path in (CONFIGS / "env").glob("*.yaml"))
+    algorithms = sorted(path.stem for path in (CONFIGS / "algo").glob("*.yaml"))
+    assert len(tasks) == 10 and {"aca", "sac"} <= set(algorithms)
+    for task in tasks:
+        cfg = composed(f"env={task}")
+        observation, _ = make_env(cfg.env.name).reset(seed=0)
+        assert observation.dtype == np.float32
+        header = (CONFIGS / "env" / f"{task}.yaml").read_text()
+        sizes = re.search(r"(\d+) observations, (\d+) action", header)
+        assert observation.shape == (int(sizes[1]),)
+        assert make_env(cfg.env.name).action_space.shape == (int(sizes[2]),)
+    for algorithm in algorithms:
+        assert composed(f"algo={algorithm}").algo.name == algorithm
+    assert composed(name="quickstart").algo.name == "aca"
+
+
+def test_humanoid_settings_win_over_the_algorithm_and_quickstart_over_both():
+    humanoid, other = composed("env=humanoid").aca, composed().aca
+    assert (humanoid.guidance_weight, other.guidance_weight) == (60, 50)
+    assert (humanoid.target_entropy_scale, other.target_entropy_scale) == (0.5, 0.9)
+    assert (humanoid.exploration_noise, other.exploration_noise) == (0.15, 0.1)
+    assert composed(name="quickstart").optim.total_updates < composed().optim.total_updates
