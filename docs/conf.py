@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import inspect
 from importlib.metadata import version as installed_version
 
 project = "torchrl-aca"
@@ -15,6 +16,7 @@ extensions = [
     "sphinx.ext.viewcode",
 ]
 exclude_patterns = ["_build"]
+default_role = "literal"  # docstrings of `training` have single backticks
 html_theme = "furo"
 html_title = f"torchrl-aca {release}"
 
@@ -23,6 +25,7 @@ myst_heading_anchors = 3
 
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
+napoleon_use_ivar = True  # an attribute that is a property too is not described twice
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"
 autodoc_typehints_description_target = "documented"
@@ -37,3 +40,16 @@ if tags.has("online"):  # noqa: F821 (Sphinx puts `tags` into this file's namesp
         "tensordict": ("https://docs.pytorch.org/tensordict/stable", None),
         "torchrl": ("https://docs.pytorch.org/rl/stable", None),
     }
+
+
+def show_constructor(app, what, name, obj, options, signature, returns):
+    """Give classes their constructor's signature where a metaclass of TorchRL hides it."""
+    if what == "class" and signature == "(*args, **kwargs)":
+        parameters = list(inspect.signature(obj.__init__).parameters.values())[1:]
+        bare = [parameter.replace(annotation=inspect.Parameter.empty) for parameter in parameters]
+        return str(inspect.Signature(bare)), returns
+    return signature, returns
+
+
+def setup(app):
+    app.connect("autodoc-process-signature", show_constructor)

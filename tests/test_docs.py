@@ -68,11 +68,11 @@ def can_import(module: str) -> bool:
     return True
 
 
-def docstrings():
+def docstrings() -> list[doctest.DocTest]:
     names = [m.name for m in pkgutil.walk_packages(torchrl_aca.__path__, "torchrl_aca.")]
     finder = doctest.DocTestFinder(exclude_empty=True)
-    for module in map(importlib.import_module, names):
-        yield from (test for test in finder.find(module) if test.examples)
+    modules = map(importlib.import_module, names)
+    return [test for module in modules for test in finder.find(module) if test.examples]
 
 
 @pytest.mark.parametrize("example", docstrings(), ids=lambda example: example.name)
@@ -164,33 +164,48 @@ def plain(value: object) -> object:
     return OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
 
 
-@pytest.mark.parametrize("algorithm", ["aca", "sac"])
-def test_metrics_page_has_every_column(algorithm, tmp_path, monkeypatch):
-    documented = {row[0].strip("`") for row in table_rows("howto/metrics.md")}
-    monkeypatch.syspath_prepend(str(ROOT / "recipes"))
-    train = importlib.import_module("online_mujoco").train
-    cfg = composed(
-        f"algo={algorithm}",
-        "env=reacher",
-        f"run_dir={tmp_path / 'run'}",
-        f"{algorithm}.num_cells=[8]",
-        "collector.init_random_frames=250",
-        "optim.batch_size=8",
-        "optim.total_updates=2",
-        "logger.interval=1",
-        "eval.episodes=1",
-        *(["aca.num_candidates=2", "aca.num_target_candidates=2"] if algorithm == "aca" else []),
-    )
-    run_dir = train(cfg)
-    for table in ("metrics.csv", "eval.csv"):
-        with open(run_dir / table, newline="") as file:
-            columns = csv.DictReader(file).fieldnames
-        assert set(columns) <= documented, set(columns) - documented
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """Directories of two tiny runs, by algorithm."""
+    folder = tmp_path_factory.mktemp("runs")
+    sizes = {"aca": ["aca.num_candidates=2", "aca.num_target_candidates=2"], "sac": []}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.syspath_prepend(str(ROOT / "recipes"))
+        train = importlib.import_module("online_mujoco").train
+        return {
+            algorithm: train(
+                composed(
+                    f"algo={algorithm}",
+                    "env=reacher",
+                    f"run_dir={folder / algorithm}",
+                    f"{algorithm}.num_cells=[8]",
+                    "collector.init_random_frames=250",
+                    "optim.batch_size=8",
+                    "optim.total_updates=2",
+                    "logger.interval=1",
+                    "eval.episodes=1",
+                    *overrides,
+                )
+            )
+            for algorithm, overrides in sizes.items()
+        }
 
 
-def test_metrics_page_has_every_entry_of_the_loss():
+def test_metrics_page_has_exactly_what_is_written(runs):
     critic = torchrl_aca.NoiseLevelCritic(3, 2, num_cells=(8,))
     actor = torchrl_aca.CriticGuidedDenoisingActor(critic, torchrl_aca.NoiseSchedule.cosine(20))
     loss = torchrl_aca.ACALoss(actor)
-    documented = {row[0].strip("`") for row in table_rows("howto/metrics.md")}
-    assert {*loss.out_keys, loss.tensor_keys.priority} <= documented
+    written = {*loss.out_keys, loss.tensor_keys.priority}
+    for run_dir in runs.values():
+        for table in ("metrics.csv", "eval.csv"):
+            with open(run_dir / table, newline="") as file:
+                written |= set(csv.DictReader(file).fieldnames)
+    assert written == {row[0].strip("`") for row in table_rows("howto/metrics.md")}
+
+
+def test_a_run_leaves_the_files_and_the_state_that_the_pages_name(runs):
+    named = {row[0].strip("`") for row in table_rows("quickstart.md")}
+    assert {path.name for path in runs["aca"].iterdir()} == {name.rstrip("/") for name in named}
+    (checkpoint,) = (runs["aca"] / "checkpoints").iterdir()
+    assert "agent.loss" in torch.load(checkpoint, weights_only=True)["parts"]
