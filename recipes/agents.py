@@ -33,9 +33,19 @@ class BoundedNormalParams(nn.Module):
         return mean, log_std.clamp(*self.bounds).exp()
 
 
+SCHEDULES = {
+    "cosine": NoiseSchedule.cosine,
+    "linear": NoiseSchedule.linear,
+    "vp": NoiseSchedule.vp,
+}
+
+
 def make_aca(cfg: DictConfig, env: EnvBase, device: torch.device) -> Agent:
     """ACA, in the official code's order: a TD step, then at even updates a noise-level step."""
     settings, optim = cfg.aca, cfg.optim
+    schedule = SCHEDULES.get(settings.schedule)
+    if schedule is None:
+        raise ValueError(f"aca.schedule={settings.schedule}: expected one of {list(SCHEDULES)}.")
     observation_dim = env.observation_spec["observation"].shape[-1]
     action_spec = env.action_spec_unbatched
     critic = NoiseLevelCritic(
@@ -49,7 +59,7 @@ def make_aca(cfg: DictConfig, env: EnvBase, device: torch.device) -> Agent:
     )
     actor = CriticGuidedDenoisingActor(
         critic,
-        getattr(NoiseSchedule, settings.schedule)(settings.num_steps),
+        schedule(settings.num_steps),
         spec=action_spec,
         guidance_weight=settings.guidance_weight,
         num_candidates=settings.num_candidates,
@@ -105,7 +115,7 @@ def make_aca(cfg: DictConfig, env: EnvBase, device: torch.device) -> Agent:
 
 def lr_factor(optim: DictConfig, step: int) -> float:
     """Returns the factor of `lr` after so many optimiser steps: linear decay to `lr_end`."""
-    span = optim.lr_decay_end - optim.lr_decay_start
+    span = max(optim.lr_decay_end - optim.lr_decay_start, 1)
     progress = min(max((step - optim.lr_decay_start) / span, 0.0), 1.0)
     return 1 + progress * (optim.lr_end / optim.lr - 1)
 

@@ -45,7 +45,7 @@ def train(cfg: DictConfig, checkpoint: dict[str, Any] | None = None) -> Path:
 
     env = make_vector_env(cfg.env.name, cfg.collector.num_envs, cfg.seed)
     eval_env = make_vector_env(cfg.env.name, cfg.eval.episodes, cfg.eval.seed)
-    agent = AGENTS[cfg.algo.name](cfg, env, device)
+    agent = make_agent(cfg, env, device)
     buffer = make_replay_buffer(cfg.buffer.capacity, cfg.optim.batch_size)
     episodes, means, counters = EpisodeTracker(cfg.collector.num_envs), MetricMeans(), Counters()
     parts = {
@@ -93,6 +93,14 @@ def train(cfg: DictConfig, checkpoint: dict[str, Any] | None = None) -> Path:
             report_extras(cfg, run, agent, eval_env, device)
     collector.shutdown()
     return run.dir
+
+
+def make_agent(cfg: DictConfig, env: EnvBase, device: torch.device) -> Agent:
+    """Builds the agent; a value that one of its parts refuses is told in one message."""
+    try:
+        return AGENTS[cfg.algo.name](cfg, env, device)
+    except ValueError as error:
+        raise RunError(f"algo={cfg.algo.name} cannot be built: {error}") from error
 
 
 def updates_due(cfg: DictConfig, frames: int) -> int:

@@ -225,6 +225,23 @@ def test_bad_configurations_are_refused_before_any_work(train, tmp_path, overrid
     assert not (tmp_path / "here").exists()
 
 
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("aca.noise_level_interval=0", "noise_level_interval=0.*positive integer"),
+        ("aca.num_candidates=-1", "num_candidates=-1.*positive integer"),
+        ("optim.lr_end=0", "optim.lr_end=0: expected a number above 0"),
+        ("aca.schedule=steep", "aca.schedule=steep: expected one of.*cosine"),
+        ("aca.first_level=3", "cannot be built: first_level must be 0 or 1, got 3"),
+    ],
+)
+def test_bad_settings_of_aca_are_refused_before_any_work(train, tmp_path, override, message):
+    cfg = composed("algo=aca", "env=hopper", f"run_dir={tmp_path / 'here'}", override)
+    with pytest.raises(RunError, match=message):
+        train(cfg)
+    assert not (tmp_path / "here").exists()
+
+
 def test_wandb_without_login_is_refused(train, tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("NETRC", str(tmp_path / "netrc"))

@@ -209,7 +209,9 @@ class NoiseLevelCritic(NoiseLevelCriticBase):
         x = self.activation(self._first_layer(features, action, noise_level))
         for layer in self._others:
             x = self.activation(layer(x))
-        return self.value(x).squeeze(-1).movedim(0, -1).reshape(*action.shape[:-1], self.num_critics)
+        return (
+            self.value(x).squeeze(-1).movedim(0, -1).reshape(*action.shape[:-1], self.num_critics)
+        )
 
     def action_gradient(self, features: Any, action: Tensor, noise_level: Tensor) -> Tensor:
         """See :meth:`NoiseLevelCriticBase.action_gradient`; the chain rule written out.

@@ -12,21 +12,16 @@ from torchrl_aca.training.checkpoint import read_checkpoint
 from torchrl_aca.training.errors import RunError
 
 POSITIVE_INTEGERS = (
-    "collector.num_envs",
     "collector.frames_per_batch",
     "collector.init_random_frames",
     "buffer.capacity",
     "optim.total_updates",
     "optim.batch_size",
-    "eval.interval",
     "eval.episodes",
-    "checkpoint.interval",
     "checkpoint.keep_last",
-    "logger.interval",
 )
 RANGES = {
     "optim.utd_ratio": (0, float("inf")),
-    "optim.lr": (0, float("inf")),
     "optim.gamma": (0, 1),
     "optim.tau": (0, 1),
 }
@@ -43,10 +38,11 @@ def validate(cfg: DictConfig, algorithms: Iterable[str]) -> None:
     """
     _require(cfg.algo.name in algorithms, cfg, "algo.name", f"one of {sorted(algorithms)}")
     _require(cfg.logger.backend in LOGGERS, cfg, "logger.backend", f"one of {list(LOGGERS)}")
-    for key in POSITIVE_INTEGERS:
+    counts, rates = _counts_and_rates(cfg)
+    for key in (*POSITIVE_INTEGERS, *counts):
         value = OmegaConf.select(cfg, key)
         _require(isinstance(value, int) and value > 0, cfg, key, "a positive integer")
-    for key, (low, high) in RANGES.items():
+    for key, (low, high) in {**RANGES, **dict.fromkeys(rates, (0, float("inf")))}.items():
         value = OmegaConf.select(cfg, key)
         fits = isinstance(value, int | float) and low < value <= high
         _require(fits, cfg, key, f"a number above {low}, at most {high}")
@@ -59,6 +55,20 @@ def validate(cfg: DictConfig, algorithms: Iterable[str]) -> None:
             _require(fits, cfg, f"{name}.num_cells", "positive integers, one per hidden layer")
     _validate_sizes(cfg)
     _validate_seeds(cfg)
+
+
+def _counts_and_rates(cfg: DictConfig) -> tuple[list[str], list[str]]:
+    """Returns the keys that are counts or intervals, and those that are learning rates, by name."""
+    keys = [
+        (f"{section}.{name}", name)
+        for section, values in cfg.items()
+        if isinstance(values, DictConfig)
+        for name in values
+        if name != "num_cells"
+    ]
+    counts = [key for key, name in keys if name.startswith("num_") or name.endswith("interval")]
+    rates = [key for key, name in keys if name in ("lr", "lr_end") or name.endswith("_lr")]
+    return counts, rates
 
 
 def _validate_seeds(cfg: DictConfig) -> None:
