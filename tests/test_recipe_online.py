@@ -28,11 +28,9 @@ from torchrl_aca.training.errors import RunError
 ROOT = Path(__file__).parents[1]
 SCRIPT = ROOT / "recipes" / "online_mujoco.py"
 CONFIGS = ROOT / "recipes" / "configs"
-TINY = [
-    "algo=sac",
+TINY_RUN = [
     "env=hopper",
     "num_threads=1",
-    "sac.num_cells=[16,16]",
     "collector.init_random_frames=200",
     "buffer.capacity=300",
     "optim.batch_size=16",
@@ -41,6 +39,16 @@ TINY = [
     "eval.episodes=2",
     "checkpoint.interval=25",
     "logger.interval=10",
+]
+TINY = ["algo=sac", "sac.num_cells=[16,16]", *TINY_RUN]
+TINY_ACA = [
+    "algo=aca",
+    "aca.num_cells=[16,16]",
+    "aca.num_steps=3",
+    "aca.num_candidates=3",
+    "aca.num_target_candidates=2",
+    "aca.alpha_interval=20",
+    *TINY_RUN,
 ]
 
 
@@ -168,8 +176,8 @@ def test_output_says_before_and_after_and_leaves_nothing_else(unbroken):
     assert {path.name for path in unbroken.parents[1].iterdir()} == {"runs", "output.txt"}
 
 
-def test_stop_and_resume_equals_never_stopping(unbroken, tmp_path):
-    code, _, errors = run(*TINY, "optim.total_updates=34", "run_dir=here", cwd=tmp_path)
+def check_stop_and_resume(settings: list[str], unbroken: Path, tmp_path: Path) -> None:
+    code, _, errors = run(*settings, "optim.total_updates=34", "run_dir=here", cwd=tmp_path)
     assert code == 0, errors
     code, _, errors = run("resume=here", "optim.total_updates=60", cwd=tmp_path)
     assert code == 0, errors
@@ -178,6 +186,16 @@ def test_stop_and_resume_equals_never_stopping(unbroken, tmp_path):
     # The shorter run also evaluated at its own end.
     evaluations = rows_of(tmp_path / "here" / "eval.csv")
     assert [row for row in evaluations if row["updates"] != "34"] == rows_of(unbroken / "eval.csv")
+
+
+def test_stop_and_resume_equals_never_stopping(unbroken, tmp_path):
+    check_stop_and_resume(TINY, unbroken, tmp_path)
+
+
+def test_aca_stop_and_resume_equals_never_stopping(tmp_path):
+    code, _, errors = run(*TINY_ACA, "run_dir=unbroken", cwd=tmp_path)
+    assert code == 0, errors
+    check_stop_and_resume(TINY_ACA, tmp_path / "unbroken", tmp_path)
 
 
 def test_ctrl_c_leaves_a_checkpoint_that_resumes(unbroken, tmp_path):
