@@ -14,7 +14,12 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.testing.mocking_classes import ContinuousActionVecMockEnv
 
-from torchrl_aca import CriticGuidedDenoisingActor, NoiseLevelCritic, NoiseSchedule
+from torchrl_aca import (
+    CriticGuidedDenoisingActor,
+    NoiseLevelCritic,
+    NoiseLevelCriticBase,
+    NoiseSchedule,
+)
 from torchrl_aca.interop import to_official
 
 OBS, ACTION, BATCH, CANDIDATES, T = 4, 3, 6, 5, 6
@@ -422,7 +427,9 @@ def test_bounds_must_be_finite(high):
     "bad",
     [
         {"num_candidates": 0},
+        {"tile_rows": 0},
         {"guidance_weight": -1.0},
+        {"guidance_weight": float("nan")},
         {"exploration_noise": -0.1},
         {"alpha_init": 0.0},
     ],
@@ -476,6 +483,33 @@ def test_copies_act_alike_and_share_nothing(duplicate):
     assert torch.equal(act(copied, td, seed=0), act(actor, td, seed=0))
     nn.init.zeros_(copied.log_alpha)
     assert actor.log_alpha != 0
+
+
+@pytest.mark.parametrize("activation", [nn.Mish, nn.ReLU, nn.GELU, nn.SiLU, nn.Tanh, nn.ELU])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-10), (torch.float32, 1e-4)])
+def test_the_written_out_gradient_gives_the_generic_chain(
+    activation, dtype, tolerance, monkeypatch
+):
+    critic = make_critic(activation=activation, dtype=dtype)
+    actor = make_actor(critic, guidance_weight=1.0)
+    observation = torch.randn(BATCH, OBS, dtype=dtype)
+    noise = torch.randn(T + 1, CANDIDATES, BATCH, ACTION, dtype=dtype)
+    fast = actor.denoise(observation, noise)
+    generic = NoiseLevelCriticBase.action_gradient.__get__(critic)
+    monkeypatch.setattr(critic, "action_gradient", generic, raising=True)
+    torch.testing.assert_close(fast, actor.denoise(observation, noise), rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("tile_rows", [1, 2 * BATCH, 10_000])
+def test_tiles_change_no_result(tile_rows):
+    critic = make_critic(dtype=torch.float64)
+    observation = torch.randn(BATCH, OBS, dtype=torch.float64)
+    noise = torch.randn(T + 1, CANDIDATES, BATCH, ACTION, dtype=torch.float64)
+    whole, tiled = make_actor(critic), make_actor(critic, tile_rows=tile_rows)
+    candidates = whole.denoise(observation, noise)
+    torch.testing.assert_close(tiled.denoise(observation, noise), candidates, rtol=0, atol=1e-12)
+    chosen = whole.select(observation, candidates)
+    assert torch.equal(tiled.select(observation, candidates), chosen)
 
 
 def test_compiles_without_a_graph_break():

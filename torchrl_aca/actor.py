@@ -58,6 +58,8 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
             code, exploration noise may leave the box, and the loss learns from such actions.
         compile_step: run the denoising step through ``torch.compile``: seconds of compilation at
             the first call of each shape, faster steps afterwards. Default: False.
+        tile_rows: rows (states times candidates) that a CPU takes through the chain at once. It
+            changes cost and memory, not the result. Default: 1024.
         in_keys: keys of the observations. Default: those of the critic.
         out_keys: the action's key.
 
@@ -91,16 +93,15 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         alpha_init: float = 5.0,
         clip_action: bool = False,
         compile_step: bool = False,
+        tile_rows: int = 1024,
         in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] = ("action",),
     ) -> None:
         super().__init__()
-        if num_candidates < 1 or guidance_weight < 0 or exploration_noise < 0 or alpha_init <= 0:
-            raise ValueError(
-                "Expected num_candidates >= 1, guidance_weight >= 0, exploration_noise >= 0 and "
-                f"alpha_init > 0; got {num_candidates=}, {guidance_weight=}, {exploration_noise=}, "
-                f"{alpha_init=}."
-            )
+        _check_at_least(1, num_candidates=num_candidates, tile_rows=tile_rows)
+        _check_at_least(0, guidance_weight=guidance_weight, exploration_noise=exploration_noise)
+        if not alpha_init > 0:
+            raise ValueError(f"Expected alpha_init > 0, got alpha_init={alpha_init}.")
         self.critic: NoiseLevelCriticBase = as_noise_level_critic(critic)
         if getattr(critic, "num_steps", schedule.num_steps) != schedule.num_steps:
             raise ValueError(
@@ -116,6 +117,7 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         self.exploration_noise = exploration_noise
         self.clip_action = clip_action
         self.compile_step = compile_step
+        self.tile_rows = tile_rows
         self.in_keys = list(in_keys) if in_keys is not None else list(self.critic.observation_keys)
         self.out_keys = list(out_keys)
 
@@ -184,11 +186,26 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         return self.critic.encode(*rows)
 
     def _denoise(self, features: Any, noise: Tensor) -> Tensor:
+        """Chains of ``noise``, ``(T + 1, N, rows, A)``, a tile of candidates at a time."""
         levels = torch.arange(self.schedule.num_steps, 0, -1, device=noise.device)
-        action = noise[0]
-        for level, step_noise in zip(levels, noise[1:], strict=True):
-            action = self._step(features, action, step_noise, level)
-        return action
+        candidates = []
+        for tile in noise.split(self._candidates_per_tile(noise[0]), dim=1):
+            action = tile[0]
+            for level, step_noise in zip(levels, tile[1:], strict=True):
+                action = self._step(features, action, step_noise, level)
+            candidates.append(action)
+        return torch.cat(candidates)
+
+    def _candidates_per_tile(self, candidates: Tensor) -> int:
+        """As many candidates of shape ``(N, rows, A)`` as ``tile_rows`` holds.
+
+        On a CPU a tile keeps its activations in the cache, and bounds the memory. Elsewhere, and in
+        a graph that would unroll the tiles, all go at once.
+        """
+        num_candidates, num_rows, _ = candidates.shape
+        if candidates.device.type != "cpu" or torch.compiler.is_compiling():
+            return max(num_candidates, 1)
+        return max(self.tile_rows // max(num_rows, 1), 1)
 
     def _denoise_step(
         self, features: Any, noisy_action: Tensor, noise: Tensor, noise_level: Tensor
@@ -211,7 +228,8 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         if not self.compile_step or torch.compiler.is_compiling():
             return self._denoise_step
         if "_compiled_step" not in self.__dict__:
-            self.__dict__["_compiled_step"] = torch.compile(self._denoise_step, dynamic=False)
+            # Dynamic: acting, targets and evaluation differ in rows and would compile thrice.
+            self.__dict__["_compiled_step"] = torch.compile(self._denoise_step, dynamic=True)
         return self.__dict__["_compiled_step"]
 
     def __getstate__(self) -> dict[str, Any]:
@@ -220,7 +238,9 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
 
     def _select(self, features: Any, candidates: Tensor) -> Tensor:
         clean = torch.zeros((), dtype=torch.long, device=candidates.device)
-        return F.select_best(candidates, self.critic.evaluate(features, candidates, clean))
+        tiles = candidates.split(self._candidates_per_tile(candidates))
+        values = torch.cat([self.critic.evaluate(features, tile, clean) for tile in tiles])
+        return F.select_best(candidates, values)
 
     # --- acting -----------------------------------------------------------------------------------
 
@@ -278,6 +298,12 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         deterministic = exploration_type() not in (None, ExplorationType.RANDOM)
         action = self.sample(observation, batch, deterministic=deterministic)
         return tensordict.set(self.out_keys[0], action)
+
+
+def _check_at_least(least: int, **numbers: float) -> None:
+    for name, number in numbers.items():
+        if not number >= least:  # NaN too
+            raise ValueError(f"Expected {name} >= {least}, got {name}={number}.")
 
 
 def _first_parameter(critic: nn.Module) -> nn.Parameter:
