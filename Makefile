@@ -58,9 +58,9 @@ format: $(INSTALLED)  ## repair style and format
 	$(VENV) -m ruff check --fix .
 	$(VENV) -m ruff format .
 
-bench: $(INSTALLED)  ## measure speed (benchmarks/)
-	@test -d benchmarks || { echo "This version has no benchmarks/ folder, so there is nothing to measure."; exit 1; }
-	@$(WITH_TMPDIR) $(VENV) -m pytest benchmarks --benchmark-only $(ARGS)
+bench: $(INSTALLED)  ## measure speed and write results/speed.md (THREADS=2)
+	@$(WITH_TMPDIR) $(VENV) -m pytest benchmarks -q --benchmark-only --benchmark-json=$(CACHE)/speed.json $(ARGS)
+	@$(VENV) benchmarks/report.py $(CACHE)/speed.json results/speed.md
 
 clean:  ## remove caches and builds, keep .venv and outputs
 	rm -rf .cache docs/_build build dist *.egg-info

@@ -1,0 +1,67 @@
+"""Table of a benchmark run: `python benchmarks/report.py BENCHMARK.json results/speed.md`."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+from torchrl_aca.training.report import versions
+
+ROOFLINE_ROWS = {"acting, 5": 160, "acting, 1 states x 32": 32}
+HEADER = """# Speed
+
+Written by `make bench`. Medians of one run; compare ratios, not times of different machines.
+
+- *yardstick*: two plain MLPs on concatenated inputs, `torch.autograd.grad` of the sum, all rows at
+  once (`benchmarks/yardstick.py`). *eager*, *compiled*: this package, `compile_step=False` and
+  `True`.
+- *yardstick / this*: how many times as fast as the yardstick in the same run.
+- *of roofline*: matrix products of the chain, per second, over what a bare matrix product of the
+  same number of rows does in the same run. It counts the arithmetic of the chain alone, so an
+  update, which also has two optimiser steps, cannot reach it.
+
+"""
+
+
+def roofline_of(case: str, products: dict[int, float]) -> float | None:
+    """FLOP/s of the matrix product with the rows of this case; None where it has too few."""
+    if case.endswith("1 states x 1"):
+        return None
+    return products[next((rows for text, rows in ROOFLINE_ROWS.items() if text in case), 1024)]
+
+
+def table(results: list[dict]) -> str:
+    """One row per case and variant: time, ratio to the yardstick, share of the roofline."""
+    rows = [(r["extra_info"], r["stats"]["median"]) for r in results]
+    roofline = [row for row in rows if row[0]["variant"] == "roofline"]
+    products = {info["rows"]: info["flops"] / seconds for info, seconds in roofline}
+    seconds_of = {(info["case"], info["variant"]): seconds for info, seconds in rows}
+    lines = [
+        "| case | variant | median | yardstick / this | of roofline |",
+        "|---|---|--:|--:|--:|",
+    ]
+    for info, seconds in rows:
+        yardstick = seconds_of.get((info["case"], "yardstick"))
+        peak = roofline_of(info["case"], products)
+        ratio = f"{yardstick / seconds:.2f}" if yardstick else ""
+        share = f"{info['flops'] / seconds / peak:.0%}" if peak else ""
+        if info["variant"] == "roofline":
+            ratio, share = "", f"{products[info['rows']] / 1e9:.0f} GFLOP/s"
+        time = f"{1e3 * seconds:.1f} ms"
+        lines.append(f"| {info['case']} | {info['variant']} | {time} | {ratio} | {share} |")
+    return "\n".join(lines)
+
+
+def main(source: Path, output: Path) -> None:
+    """Prints the table and writes it with the machine and the versions."""
+    results = json.loads(source.read_text())["benchmarks"]
+    machine = {**versions(), "threads": results[0]["extra_info"]["threads"]}
+    facts = "".join(f"- {name}: {value}\n" for name, value in machine.items() if value is not None)
+    text = f"{HEADER}{facts}\n{table(results)}\n"
+    output.write_text(text)
+    print(text)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), Path(sys.argv[2]))

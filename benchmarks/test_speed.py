@@ -1,0 +1,137 @@
+"""Speed of the chain, of acting and of an update, for `make bench`.
+
+THREADS sets torch's threads (default: all cores). Everything is compared inside one run: with the
+matrix-product roofline of the machine at that moment and with the yardstick. Nothing is asserted.
+"""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.objectives import SoftUpdate
+from yardstick import PlainAgent
+
+from torchrl_aca import ACALoss, CriticGuidedDenoisingActor, NoiseLevelCritic, NoiseSchedule
+
+SIZES = {"HalfCheetah": (17, 6), "Humanoid": (376, 17)}
+BATCH, WIDTH, NUM_STEPS = 256, 256, 20
+VARIANTS = ("yardstick", "eager", "compiled")
+torch.set_num_threads(int(os.environ.get("THREADS", os.cpu_count() or 1)))
+
+
+def flops(rows: int, action_dim: int) -> float:
+    """Matrix products of a chain: two critics, forward and back, of the action's share alone."""
+    return NUM_STEPS * 2 * 2 * 2 * rows * (action_dim * WIDTH + 2 * WIDTH * WIDTH + WIDTH)
+
+
+def make_actor(size: str, variant: str, num_candidates: int) -> CriticGuidedDenoisingActor:
+    return CriticGuidedDenoisingActor(
+        NoiseLevelCritic(*SIZES[size]),
+        NoiseSchedule.cosine(NUM_STEPS),
+        num_candidates=num_candidates,
+        compile_step=variant == "compiled",
+    )
+
+
+def make_batch(size: str) -> TensorDict:
+    observation_dim, action_dim = SIZES[size]
+    ended = torch.zeros(BATCH, 1, dtype=torch.bool)
+    following = TensorDict(
+        observation=torch.randn(BATCH, observation_dim),
+        reward=torch.randn(BATCH, 1),
+        done=ended,
+        terminated=ended.clone(),
+        batch_size=[BATCH],
+    )
+    return TensorDict(
+        observation=torch.randn(BATCH, observation_dim),
+        action=torch.rand(BATCH, action_dim) * 2 - 1,
+        next=following,
+        batch_size=[BATCH],
+    )
+
+
+def measure(benchmark, call, rows: int, case: str, variant: str, work: float) -> None:
+    """Times `call` after two warm-up rounds, which compile it where it is compiled."""
+    threads = torch.get_num_threads()
+    info = {"case": case, "variant": variant, "rows": rows, "flops": work, "threads": threads}
+    benchmark.extra_info.update(info)
+    rounds = 3 if rows > 4096 else 10
+    benchmark.pedantic(call, rounds=rounds, warmup_rounds=2, iterations=1)
+
+
+@pytest.mark.parametrize("rows", [32, 160, 1024])
+def test_roofline(benchmark, rows):
+    x, weight = torch.randn(2, rows, WIDTH), torch.randn(2, WIDTH, WIDTH)
+    work = 20 * 2 * 2 * rows * WIDTH * WIDTH
+
+    def products():
+        for _ in range(20):
+            x @ weight
+
+    measure(benchmark, products, rows, f"matrix product, 2 x {rows} rows", "roofline", work)
+
+
+def sampling(benchmark, size: str, num_states: int, num_candidates: int, variant: str, case: str):
+    observation = torch.randn(num_states, SIZES[size][0])
+    if variant == "yardstick":
+        plain = PlainAgent(*SIZES[size], NUM_STEPS)
+
+        def call():
+            plain.sample(observation, num_candidates)
+    else:
+        actor = make_actor(size, variant, num_candidates)
+
+        def call():
+            actor.sample(observation, [num_states])
+
+    rows = num_states * num_candidates
+    measure(benchmark, call, rows, case, variant, flops(rows, SIZES[size][1]))
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("num_candidates", [1, 4, 32, 128])
+@pytest.mark.parametrize("size", SIZES)
+def test_target_actions(benchmark, size, num_candidates, variant):
+    if num_candidates == 128 and variant != "compiled":
+        pytest.skip("four times the case with 32 candidates, and as slow")
+    case = f"{size}: target actions, {BATCH} states x {num_candidates}"
+    sampling(benchmark, size, BATCH, num_candidates, variant, case)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize(("num_states", "num_candidates"), [(5, 32), (1, 32), (1, 1)])
+def test_acting(benchmark, num_states, num_candidates, variant):
+    case = f"HalfCheetah: acting, {num_states} states x {num_candidates}"
+    sampling(benchmark, "HalfCheetah", num_states, num_candidates, variant, case)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("num_candidates", [1, 4, 32])
+@pytest.mark.parametrize("size", SIZES)
+def test_update(benchmark, size, num_candidates, variant):
+    """TD step, noise-level step, target step: the work of an even update of the recipe."""
+    batch = make_batch(size)
+    if variant == "yardstick":
+        plain = PlainAgent(*SIZES[size], NUM_STEPS)
+
+        def call():
+            plain.update(batch, num_candidates)
+    else:
+        loss = ACALoss(make_actor(size, variant, num_candidates))
+        target_update = SoftUpdate(loss, tau=0.005)
+        optimizer = torch.optim.Adam(loss.qvalue_network.parameters(), lr=1e-3)
+
+        def call():
+            for name in ("qvalue", "noise_level"):
+                getattr(loss, f"{name}_loss")(batch)[f"loss_{name}"].backward()
+                optimizer.step()
+                optimizer.zero_grad()
+            target_update.step()
+
+    rows = BATCH * num_candidates
+    case = f"{size}: update, {num_candidates} target candidates"
+    measure(benchmark, call, rows, case, variant, flops(rows, SIZES[size][1]))

@@ -1,0 +1,67 @@
+"""The benchmarks compare like with like, and their report divides what it should."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchrl_aca import CriticGuidedDenoisingActor, NoiseLevelCritic, NoiseSchedule
+from torchrl_aca.interop import load_official
+
+
+@pytest.fixture(autouse=True)
+def benchmarks_on_the_path(monkeypatch):
+    monkeypatch.setattr(sys, "path", [str(Path(__file__).parents[1] / "benchmarks"), *sys.path])
+
+
+def official(critic) -> dict:
+    """Parameters of a `PlainCritic` in the official code's names and layout."""
+    layers = [m for m in critic.modules() if isinstance(m, torch.nn.Linear)]
+    names = ["linear", *(f"linear_{i}" for i in range(1, len(layers)))]
+    arrays = {}
+    for name, layer in zip(names, layers, strict=True):
+        arrays[f"{name}.w"] = layer.weight.detach().T.numpy()
+        arrays[f"{name}.b"] = layer.bias.detach().numpy()
+    return arrays
+
+
+def test_the_yardstick_samples_what_the_actor_samples(monkeypatch):
+    from yardstick import PlainAgent
+
+    num_steps, num_candidates, batch, action_dim = 4, 3, 5, 2
+    plain = PlainAgent(7, action_dim, num_steps)
+    critic = NoiseLevelCritic(7, action_dim, num_steps=num_steps)
+    load_official(critic, *map(official, plain.critics))
+    schedule = NoiseSchedule.cosine(num_steps)
+    actor = CriticGuidedDenoisingActor(critic, schedule, num_candidates=num_candidates)
+
+    observation = torch.randn(batch, 7)
+    noise = torch.randn(num_steps + 1, num_candidates, batch, action_dim)
+    draws = iter(noise.flatten(1, 2))
+    monkeypatch.setattr(torch, "randn", lambda *shape: next(draws))
+    monkeypatch.setattr(torch, "randn_like", lambda like: next(draws))
+    action = plain.sample(observation, num_candidates)
+    expected = actor.select(observation, actor.denoise(observation, noise))
+    torch.testing.assert_close(action, expected, rtol=0, atol=1e-4)
+
+
+def test_the_report_divides_by_yardstick_and_roofline():
+    from report import table
+
+    def result(case, variant, rows, flops, seconds):
+        info = {"case": case, "variant": variant, "rows": rows, "flops": flops}
+        return {"extra_info": info, "stats": {"median": seconds}}
+
+    text = table(
+        [
+            result("product", "roofline", 1024, 100e9, 1.0),  # 100 GFLOP/s
+            result("chain", "yardstick", 1024, 200e9, 8.0),  # 25 GFLOP/s
+            result("chain", "compiled", 1024, 200e9, 2.5),  # 80 GFLOP/s
+        ]
+    )
+    assert "| product | roofline | 1000.0 ms |  | 100 GFLOP/s |" in text
+    assert "| chain | yardstick | 8000.0 ms | 1.00 | 25% |" in text
+    assert "| chain | compiled | 2500.0 ms | 3.20 | 80% |" in text
