@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -34,6 +34,10 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
     uses one fixed set of draws, the same for every state: the action is then a function of the
     observation and the weights alone. Best of N stays.
 
+    With ``sampler="langevin"`` the same chains take ``T`` Langevin steps along the gradient of the
+    critic at level 0 instead (Langevin-Q of the paper's appendix). Any critic with a level 0 will
+    do, one that ignores the noise level as well.
+
     Data holds actions in the env's units, the critic sees [-1, 1]; :meth:`to_env` and
     :meth:`from_env` map between the two by the bounds of ``spec``.
 
@@ -50,7 +54,10 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         guidance_weight: ``w``. Default: 50.
         num_candidates: ``N``. Default: 32.
         normalize_gradient: guide by the unit gradient. Default: True.
-        clip_denoised: clip the clean estimate to [-1, 1] in every step. Default: True.
+        clip_denoised: clip the clean estimate to [-1, 1] in every step, or to [-c, c] for a number
+            ``c``. Langevin steps make no clean estimate to clip. Default: True.
+        sampler: ``"denoising"`` or ``"langevin"``. Default: ``"denoising"``.
+        langevin_step_size: ``eps`` of the Langevin step. Default: 1e-3.
         exploration_noise: standard deviation of the exploration noise at ``alpha = 1``, in critic
             units. Default: 0.1.
         alpha_init: initial ``alpha``. Default: 5.
@@ -86,7 +93,9 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         guidance_weight: float = 50.0,
         num_candidates: int = 32,
         normalize_gradient: bool = True,
-        clip_denoised: bool = True,
+        clip_denoised: bool | float = True,
+        sampler: Literal["denoising", "langevin"] = "denoising",
+        langevin_step_size: float = 1e-3,
         exploration_noise: float = 0.1,
         alpha_init: float = 5.0,
         clip_action: bool = False,
@@ -101,6 +110,11 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
                 f"alpha_init > 0; got {num_candidates=}, {guidance_weight=}, {exploration_noise=}, "
                 f"{alpha_init=}."
             )
+        if sampler not in ("denoising", "langevin") or langevin_step_size <= 0:
+            raise ValueError(
+                'Expected sampler="denoising" or "langevin" and langevin_step_size > 0; got '
+                f"{sampler=}, {langevin_step_size=}."
+            )
         self.critic: NoiseLevelCriticBase = as_noise_level_critic(critic)
         if getattr(critic, "num_steps", schedule.num_steps) != schedule.num_steps:
             raise ValueError(
@@ -113,6 +127,8 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         self.num_candidates = num_candidates
         self.normalize_gradient = normalize_gradient
         self.clip_denoised = clip_denoised
+        self.sampler = sampler
+        self.langevin_step_size = langevin_step_size
         self.exploration_noise = exploration_noise
         self.clip_action = clip_action
         self.compile_step = compile_step
@@ -155,7 +171,8 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
             observation: the observation of shape ``(*batch, O)``, or one tensor for each of
                 ``in_keys``.
             noise: standard normal draws of shape ``(T + 1, N, *batch, A)``: row 0 is ``a_T``, row
-                ``k`` belongs to the ``k``-th step; the last row is multiplied by zero.
+                ``k`` belongs to the ``k``-th step; denoising multiplies the last row by zero, the
+                Langevin sampler adds noise in every step.
 
         Returns:
             All candidates in critic units, shape ``(N, *batch, A)``.
@@ -163,6 +180,18 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         batch = noise.shape[2:-1]
         rows = noise.reshape(*noise.shape[:2], batch.numel(), noise.shape[-1])
         return self._denoise(self._encode(observation, batch), rows).reshape(noise.shape[1:])
+
+    def trajectory(self, observation: Tensor | Sequence[Tensor], noise: Tensor) -> Tensor:
+        """As :meth:`denoise`, with every step kept: ``a_T .. a_0``, shape ``(T+1, N, *batch, A)``.
+
+        Args:
+            observation: as in :meth:`denoise`.
+            noise: as in :meth:`denoise`.
+        """
+        batch = noise.shape[2:-1]
+        rows = noise.reshape(*noise.shape[:2], batch.numel(), noise.shape[-1])
+        path = self._path(self._encode(observation, batch), rows)
+        return torch.stack(path).reshape(noise.shape)
 
     def select(self, observation: Tensor | Sequence[Tensor], candidates: Tensor) -> Tensor:
         """The best candidate by the minimum over the critics at level 0.
@@ -184,20 +213,32 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         return self.critic.encode(*rows)
 
     def _denoise(self, features: Any, noise: Tensor) -> Tensor:
+        return self._path(features, noise)[-1]
+
+    def _path(self, features: Any, noise: Tensor) -> list[Tensor]:
         levels = torch.arange(self.schedule.num_steps, 0, -1, device=noise.device)
-        action = noise[0]
+        path = [noise[0]]
         for level, step_noise in zip(levels, noise[1:], strict=True):
-            action = self._step(features, action, step_noise, level)
-        return action
+            path.append(self._step(features, path[-1], step_noise, level))
+        return path
+
+    def _chain_step(
+        self, features: Any, action: Tensor, noise: Tensor, noise_level: Tensor
+    ) -> Tensor:
+        """One step of the chosen sampler."""
+        if self.sampler == "denoising":
+            return self._denoise_step(features, action, noise, noise_level)
+        gradient = self._gradient(features, action, torch.zeros_like(noise_level))
+        return F.langevin_step(
+            action, gradient, self.guidance_weight, self.langevin_step_size, noise
+        )
 
     def _denoise_step(
         self, features: Any, noisy_action: Tensor, noise: Tensor, noise_level: Tensor
     ) -> Tensor:
         """``a_t -> a_{t-1}``; the level is a tensor, so that one compiled step serves them all."""
         index = noise_level - 1 + self.critic.first_level
-        gradient = self.critic.action_gradient(features, noisy_action, index)
-        if self.normalize_gradient:
-            gradient = F.normalize_gradient(gradient)
+        gradient = self._gradient(features, noisy_action, index)
         variance = self.schedule.posterior_variance
         sigma = self.schedule.at(variance, noise_level, noisy_action.dtype).sqrt()
         predicted_noise = F.guided_noise(gradient, self.guidance_weight, sigma)
@@ -205,13 +246,17 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
             noisy_action, predicted_noise, noise, noise_level, clip=self.clip_denoised
         )
 
+    def _gradient(self, features: Any, action: Tensor, index: Tensor) -> Tensor:
+        gradient = self.critic.action_gradient(features, action, index)
+        return F.normalize_gradient(gradient) if self.normalize_gradient else gradient
+
     @property
     def _step(self) -> Callable[..., Tensor]:
-        """The denoising step, compiled once on first use where the actor was built so."""
+        """The sampler's step, compiled once on first use where the actor was built so."""
         if not self.compile_step or torch.compiler.is_compiling():
-            return self._denoise_step
+            return self._chain_step
         if "_compiled_step" not in self.__dict__:
-            self.__dict__["_compiled_step"] = torch.compile(self._denoise_step, dynamic=False)
+            self.__dict__["_compiled_step"] = torch.compile(self._chain_step, dynamic=False)
         return self.__dict__["_compiled_step"]
 
     def __getstate__(self) -> dict[str, Any]:
