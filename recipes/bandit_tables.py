@@ -56,9 +56,13 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
 def as_text(rows: Sequence[Mapping[str, Any]]) -> str:
     """The rows below their keys, in columns."""
     names = list(dict.fromkeys(itertools.chain.from_iterable(rows)))
-    lines = [names, *([str(row.get(name, "")) for name in names] for row in rows)]
+    lines = [names, *([_cell(row.get(name, "")) for name in names] for row in rows)]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return "\n".join(
         "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()
         for line in lines
     )
+
+
+def _cell(value: Any) -> str:
+    return f"{value:.3f}" if isinstance(value, float) else str(value)
