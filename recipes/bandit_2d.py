@@ -14,9 +14,9 @@ no spec, so that nothing is scaled. N = 1 and no exploration noise: what counts 
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 import pickle
+import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
@@ -24,10 +24,11 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+import bandit_tables as tables
 import hydra
 import torch
 from bandit_figures import draw_figures
-from bandit_tables import METHODS, Row, as_text, summary, write_csv
+from bandit_tables import METHODS, Row
 from omegaconf import DictConfig, OmegaConf
 from torchrl import logger as torchrl_logger
 from torchrl.collectors import Collector
@@ -172,10 +173,10 @@ def study(cfg: DictConfig, run_dir: Path) -> None:
         reported += rows
         swept += sweep_rows
         actors.setdefault(method, pickle.loads(actor))
-    table = summary(reported)
+    table = tables.summary(reported)
     for name, rows in (("seeds", reported), ("sweep", swept), ("table", table)):
-        write_csv(run_dir / f"{name}.csv", rows)
-    print(as_text(table))
+        tables.write_csv(run_dir / f"{name}.csv", rows)
+    print(tables.as_text(table))
     if cfg.figures:
         draw_figures(run_dir, actors, reported, swept)
 
@@ -193,8 +194,10 @@ def ablate(cfg: DictConfig, run_dir: Path) -> None:
     table = []
     for changed, (rows, *_) in zip(settings, run_all(tasks, cfg.num_workers), strict=True):
         table += [{**changed, **row} for row in rows]
-    write_csv(run_dir / "ablation.csv", table)
-    print(as_text(table))
+    tables.write_csv(run_dir / "ablation.csv", table)
+    compact = tables.side_by_side(table, [*cfg.ablation.training, *cfg.ablation.sampling])
+    tables.write_csv(run_dir / "ablation_table.csv", compact)
+    print(tables.as_text(compact))
 
 
 def validate(cfg: DictConfig) -> None:
@@ -231,8 +234,11 @@ def main(cfg: DictConfig) -> None:
     (run_dir / "config.yaml").write_text(OmegaConf.to_yaml(cfg))
     start = time.perf_counter()
     (ablate if cfg.ablation.training else study)(cfg, run_dir)
-    info = {**versions(), "minutes": round((time.perf_counter() - start) / 60, 1)}
-    (run_dir / "versions.json").write_text(json.dumps(info, indent=2) + "\n")
+    minutes = round((time.perf_counter() - start) / 60, 1)
+    command = " ".join(["python", *sys.argv])
+    tables.write_card(
+        run_dir, {"command": command, "wall-clock time": f"{minutes} min", **versions()}
+    )
     print(f"run directory: {run_dir}")
 
 

@@ -43,6 +43,25 @@ def summary(rows: Sequence[Row]) -> list[Row]:
     return table
 
 
+def side_by_side(rows: Sequence[Row], settings: Sequence[str]) -> list[Row]:
+    """One row for each combination of `settings`: per method the sum of shares, and its w."""
+    table: dict[tuple, Row] = {}
+    for row in rows:
+        values = {name: row[name] for name in settings}
+        line = table.setdefault(tuple(values.values()), values)
+        runs = [r for r in rows if all(r[k] == row[k] for k in (*settings, "method"))]
+        line[f"{METHODS[row['method']]} sum"] = f"{statistics.fmean(r['sum'] for r in runs):.3f}"
+        line[f"{METHODS[row['method']]} w"] = " ".join(f"{r['weight']:g}" for r in runs)
+    return list(table.values())
+
+
+def write_card(run_dir: Path, info: Mapping[str, Any]) -> None:
+    """Writes card.md: the command, the versions and the machine."""
+    lines = [f"| {name} | {value} |" for name, value in info.items() if value is not None]
+    text = "\n".join(["# The 2D bandit study", "", "| | |", "|---|---|", *lines, ""])
+    (run_dir / "card.md").write_text(text)
+
+
 def write_csv(path: Path, rows: Sequence[Row]) -> None:
     """Writes the rows below their keys; numbers to four digits after the point."""
     names = list(dict.fromkeys(itertools.chain.from_iterable(rows)))

@@ -169,7 +169,7 @@ def test_command_writes_all_its_files(tmp_path):
     assert result.returncode == 0, result.stderr
     figures = {"reward.png", "samples.png", "sensitivity.png", "value_maps.png", "steps.gif"}
     figures |= {f"steps_{method}.png" for method in METHODS}
-    tables = {"table.csv", "seeds.csv", "sweep.csv", "config.yaml", "versions.json"}
+    tables = {"table.csv", "seeds.csv", "sweep.csv", "config.yaml", "card.md"}
     assert {path.name for path in (tmp_path / "run").iterdir()} == figures | tables
     table = rows(tmp_path / "run" / "table.csv")
     assert [row["source"] for row in table] == ["here, 1 seeds", "paper"] * 3
@@ -178,15 +178,26 @@ def test_command_writes_all_its_files(tmp_path):
     assert "ACA" in result.stdout and "3/3" in result.stderr
 
 
-def test_ablation_has_a_row_for_each_combination_with_two_workers(tmp_path):
-    changes = ["num_workers=2", "methods=[aca]", "ablation.training={data: [uniform, online]}"]
-    arguments = ["--config-name", "bandit_2d_ablation", *TINY, *changes]
-    result = start(*arguments, "run_dir=run", cwd=tmp_path)
-    assert result.returncode == 0, result.stderr
-    table = rows(tmp_path / "run" / "ablation.csv")
-    keys = ("data", "clip_denoised", "normalize_gradient")
-    expected = itertools.product(("uniform", "online"), ("False", "2.0"), ("True", "False"))
-    assert [tuple(row[key] for key in keys) for row in table] == list(expected)
+def test_ablation_has_a_row_for_each_combination(tmp_path):
+    import bandit_2d
+
+    changes = ["methods=[aca]", "ablation.training.data=[uniform,online]"]
+    bandit_2d.ablate(composed(*TINY, *changes, name="bandit_2d_ablation"), tmp_path)
+    table = rows(tmp_path / "ablation.csv")
+    keys = ("chain.schedule", "data", "clip_denoised", "normalize_gradient")
+    values = [
+        ("linear", "vp", "cosine"),
+        ("uniform", "online"),
+        ("False", "2.0"),
+        ("True", "False"),
+    ]
+    expected = list(itertools.product(*values))
+    assert [tuple(row[key] for key in keys) for row in table] == expected
+    compact = rows(tmp_path / "ablation_table.csv")
+    assert [tuple(row[key] for key in keys) for row in compact] == expected
+    assert [float(row["ACA sum"]) for row in compact] == [
+        pytest.approx(float(row["sum"]), abs=1e-3) for row in table
+    ]
 
 
 def test_ablation_config_composes_and_its_values_are_valid():
