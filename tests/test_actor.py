@@ -106,8 +106,10 @@ def test_trajectory_begins_at_the_noise_and_ends_at_the_candidates(sampler):
     torch.testing.assert_close(path[-1], actor.denoise(observation, noise), rtol=0, atol=0)
 
 
-@pytest.mark.parametrize("bad", [{"sampler": "gibbs"}, {"langevin_step_size": 0.0}])
-def test_sampler_must_be_known_and_its_step_positive(bad):
+@pytest.mark.parametrize(
+    "bad", [{"sampler": "gibbs"}, {"langevin_step_size": 0.0}, {"clip_denoised": -1.0}]
+)
+def test_sampler_must_be_known_and_its_numbers_in_range(bad):
     with pytest.raises(ValueError, match="sampler="):
         make_actor(**bad)
 

@@ -110,10 +110,10 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
                 f"alpha_init > 0; got {num_candidates=}, {guidance_weight=}, {exploration_noise=}, "
                 f"{alpha_init=}."
             )
-        if sampler not in ("denoising", "langevin") or langevin_step_size <= 0:
+        if sampler not in ("denoising", "langevin") or langevin_step_size <= 0 or clip_denoised < 0:
             raise ValueError(
-                'Expected sampler="denoising" or "langevin" and langevin_step_size > 0; got '
-                f"{sampler=}, {langevin_step_size=}."
+                'Expected sampler="denoising" or "langevin", langevin_step_size > 0 and '
+                f"clip_denoised >= 0; got {sampler=}, {langevin_step_size=}, {clip_denoised=}."
             )
         self.critic: NoiseLevelCriticBase = as_noise_level_critic(critic)
         if getattr(critic, "num_steps", schedule.num_steps) != schedule.num_steps:
