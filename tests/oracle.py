@@ -118,7 +118,7 @@ def denoising_step(noisy, guided, noise, sched, k, clip=True):
     """a_k -> a_(k-1) through the clean estimate; without ``clip`` this is Definition 1 itself."""
     row = {key: values[k - 1] for key, values in sched.items()}
     clean = predict_clean(noisy, guided, row["alphas_cumprod"])
-    clean = np.clip(clean, -1, 1) if clip else clean
+    clean = np.clip(clean, -float(clip), float(clip)) if clip else clean
     mean = row["posterior_mean_coef1"] * clean + row["posterior_mean_coef2"] * noisy
     return mean + np.sqrt(row["posterior_variance"]) * noise  # the variance is 0 at k = 1
 
@@ -133,6 +133,16 @@ def denoise(
         gradient = normalize(gradient) if unit else gradient
         guided = guided_noise(gradient, sched["posterior_variance"][k - 1], weight)
         x = denoising_step(x, guided, noise, sched, k, clip)
+    return x
+
+
+def langevin(critics, obs, initial_noise, step_noise, weight=50.0, step_size=1e-3, unit=True):
+    """As ``denoise``, by Langevin steps along the gradient at the clean level 0."""
+    x = np.asarray(initial_noise, dtype=float)
+    for noise in step_noise:
+        gradient = sum(critic_action_gradient(q, obs, x, 0) for q in critics)
+        gradient = normalize(gradient) if unit else gradient
+        x = x + 0.5 * step_size * weight * gradient + np.sqrt(step_size) * noise
     return x
 
 

@@ -63,8 +63,8 @@ COSINE = NoiseSchedule.cosine(T), oracle.cosine_betas(T)
 @pytest.mark.parametrize("unit", [True, False])
 @pytest.mark.parametrize(
     ("schedules", "clip"),
-    [(COSINE, True), (LINEAR, True), (LINEAR, False)],
-    ids=["cosine", "linear", "unclipped"],
+    [(COSINE, True), (LINEAR, True), (LINEAR, False), (COSINE, 2.0)],
+    ids=["cosine", "linear", "unclipped", "wide"],
 )
 @pytest.mark.parametrize("weight", [0.0, 1.0, 50.0])
 def test_denoise_equals_the_oracle(first_level, unit, schedules, clip, weight):
@@ -82,6 +82,42 @@ def test_denoise_equals_the_oracle(first_level, unit, schedules, clip, weight):
     actual = actor.denoise(observation, noise)
     assert not actual.requires_grad
     np.testing.assert_allclose(actual, expected, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("first_level", [0, 1])
+@pytest.mark.parametrize("unit", [True, False])
+def test_langevin_sampler_equals_the_oracle(first_level, unit):
+    critic = make_critic(first_level=first_level, dtype=torch.float64)
+    actor = make_actor(
+        critic, guidance_weight=20.0, normalize_gradient=unit,
+        sampler="langevin", langevin_step_size=0.01,
+    )  # fmt: skip
+    observation = torch.randn(BATCH, OBS, dtype=torch.float64)
+    noise = torch.randn(T + 1, CANDIDATES, BATCH, ACTION, dtype=torch.float64)
+    expected = oracle.langevin(
+        to_official(critic), observation.numpy(), noise[0].numpy(), noise[1:].numpy(),
+        20.0, 0.01, unit,
+    )  # fmt: skip
+    np.testing.assert_allclose(actor.denoise(observation, noise), expected, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("sampler", ["denoising", "langevin"])
+def test_trajectory_begins_at_the_noise_and_ends_at_the_candidates(sampler):
+    actor = make_actor(sampler=sampler)
+    observation, noise = torch.randn(2, 3, OBS), torch.randn(T + 1, CANDIDATES, 2, 3, ACTION)
+    path = actor.trajectory(observation, noise)
+    assert path.shape == noise.shape
+    torch.testing.assert_close(path[0], noise[0], rtol=0, atol=0)
+    torch.testing.assert_close(path[-1], actor.denoise(observation, noise), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(
+    "bad", [{"sampler": "gibbs"}, {"langevin_step_size": 0.0}, {"clip_denoised": -1.0}]
+)
+def test_sampler_must_be_known_and_its_numbers_in_range(bad):
+    (name,) = bad
+    with pytest.raises(ValueError, match=f"Expected {name}"):
+        make_actor(**bad)
 
 
 def test_without_clipping_the_chain_is_definition_1_to_the_letter():

@@ -61,6 +61,11 @@ def test_posterior_mean_by_hand():
     close(F.posterior_mean(tensor(2.0), tensor(4.0), tensor(0.25), tensor(0.5)), tensor(2.5))
 
 
+def test_langevin_step_by_hand():
+    # 1 + 0.04/2 * 3 * 2 + 0.2 * (-0.5) = 1 + 0.12 - 0.1 = 1.02.
+    close(F.langevin_step(tensor(1.0), tensor(2.0), 3.0, 0.04, tensor(-0.5)), tensor(1.02))
+
+
 def test_sinusoidal_embedding_by_hand():
     # dim = 4: frequencies 1 and 10000^(-1/2) = 0.01, sines first, all over sqrt(4).
     expected = tensor(math.sin(3), math.sin(0.03), math.cos(3), math.cos(0.03)) / 2

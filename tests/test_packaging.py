@@ -26,9 +26,10 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 ALLOWED = {
     "functional": set(),
     "schedule": {"functional"},
+    "checks": set(),
     "critic": {"functional"},
     "custom_critic": {"functional", "critic"},
-    "actor": {"functional", "schedule", "critic", "custom_critic"},
+    "actor": {"checks", "functional", "schedule", "critic", "custom_critic"},
     "loss": {"functional", "schedule", "critic", "custom_critic", "actor"},
     "interop": {"functional", "critic"},
 }

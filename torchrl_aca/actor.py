@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
+from torchrl.data import Composite, TensorSpec
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from torchrl_aca import functional as F
+from torchrl_aca.checks import action_spec, check_above, check_at_least, first_parameter
 from torchrl_aca.critic import NoiseLevelCriticBase
 from torchrl_aca.custom_critic import as_noise_level_critic
 from torchrl_aca.schedule import NoiseSchedule
@@ -34,6 +35,10 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
     uses one fixed set of draws, the same for every state: the action is then a function of the
     observation and the weights alone. Best of N stays.
 
+    With ``sampler="langevin"`` the same chains take ``T`` Langevin steps along the gradient of the
+    critic at level 0 instead (Langevin-Q of the paper's appendix). Any critic with a level 0 will
+    do, one that ignores the noise level as well.
+
     Data holds actions in the env's units, the critic sees [-1, 1]; :meth:`to_env` and
     :meth:`from_env` map between the two by the bounds of ``spec``.
 
@@ -50,7 +55,10 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         guidance_weight: ``w``. Default: 50.
         num_candidates: ``N``. Default: 32.
         normalize_gradient: guide by the unit gradient. Default: True.
-        clip_denoised: clip the clean estimate to [-1, 1] in every step. Default: True.
+        clip_denoised: clip the clean estimate to [-1, 1] in every step, or to [-c, c] for a number
+            ``c``. Langevin steps make no clean estimate to clip. Default: True.
+        sampler: ``"denoising"`` or ``"langevin"``. Default: ``"denoising"``.
+        langevin_step_size: ``eps`` of the Langevin step. Default: 1e-3.
         exploration_noise: standard deviation of the exploration noise at ``alpha = 1``, in critic
             units. Default: 0.1.
         alpha_init: initial ``alpha``. Default: 5.
@@ -88,7 +96,9 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         guidance_weight: float = 50.0,
         num_candidates: int = 32,
         normalize_gradient: bool = True,
-        clip_denoised: bool = True,
+        clip_denoised: bool | float = True,
+        sampler: Literal["denoising", "langevin"] = "denoising",
+        langevin_step_size: float = 1e-3,
         exploration_noise: float = 0.1,
         alpha_init: float = 5.0,
         clip_action: bool = False,
@@ -98,22 +108,26 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         out_keys: Sequence[NestedKey] = ("action",),
     ) -> None:
         super().__init__()
-        _check_at_least(1, num_candidates=num_candidates, tile_rows=tile_rows)
-        _check_at_least(0, guidance_weight=guidance_weight, exploration_noise=exploration_noise)
-        if not alpha_init > 0:
-            raise ValueError(f"Expected alpha_init > 0, got alpha_init={alpha_init}.")
+        check_at_least(1, num_candidates=num_candidates, tile_rows=tile_rows)
+        check_at_least(0, guidance_weight=guidance_weight, exploration_noise=exploration_noise)
+        check_at_least(0, clip_denoised=clip_denoised)
+        check_above(0, alpha_init=alpha_init, langevin_step_size=langevin_step_size)
+        if sampler not in ("denoising", "langevin"):
+            raise ValueError(f'Expected sampler="denoising" or "langevin", got {sampler!r}.')
         self.critic: NoiseLevelCriticBase = as_noise_level_critic(critic)
         if getattr(critic, "num_steps", schedule.num_steps) != schedule.num_steps:
             raise ValueError(
                 f"The critic has num_steps={critic.num_steps} noise levels, the schedule "
                 f"{schedule.num_steps}. Build both with the same number."
             )
-        anchor = _first_parameter(self.critic)
+        anchor = first_parameter(self.critic)
         self.schedule = schedule.to(anchor.device)
         self.guidance_weight = guidance_weight
         self.num_candidates = num_candidates
         self.normalize_gradient = normalize_gradient
         self.clip_denoised = clip_denoised
+        self.sampler = sampler
+        self.langevin_step_size = langevin_step_size
         self.exploration_noise = exploration_noise
         self.clip_action = clip_action
         self.compile_step = compile_step
@@ -123,7 +137,7 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
 
         self.log_alpha = nn.Parameter(anchor.new_tensor(math.log(alpha_init)))
         action_dim = action_dim or getattr(critic, "action_dim", None)
-        leaf = _action_spec(spec, self.out_keys[0], action_dim)
+        leaf = action_spec(spec, self.out_keys[0], action_dim)
         self.spec = Composite({self.out_keys[0]: leaf}).to(anchor.device)
         self.action_dim = leaf.shape[-1]
         low, high = torch.full(leaf.shape, -1.0), torch.full(leaf.shape, 1.0)
@@ -157,7 +171,8 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
             observation: the observation of shape ``(*batch, O)``, or one tensor for each of
                 ``in_keys``.
             noise: standard normal draws of shape ``(T + 1, N, *batch, A)``: row 0 is ``a_T``, row
-                ``k`` belongs to the ``k``-th step; the last row is multiplied by zero.
+                ``k`` belongs to the ``k``-th step; denoising multiplies the last row by zero, the
+                Langevin sampler adds noise in every step.
 
         Returns:
             All candidates in critic units, shape ``(N, *batch, A)``.
@@ -165,6 +180,18 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         batch = noise.shape[2:-1]
         rows = noise.reshape(*noise.shape[:2], batch.numel(), noise.shape[-1])
         return self._denoise(self._encode(observation, batch), rows).reshape(noise.shape[1:])
+
+    def trajectory(self, observation: Tensor | Sequence[Tensor], noise: Tensor) -> Tensor:
+        """As :meth:`denoise`, with every step kept: ``a_T .. a_0``, shape ``(T+1, N, *batch, A)``.
+
+        Args:
+            observation: as in :meth:`denoise`.
+            noise: as in :meth:`denoise`.
+        """
+        batch = noise.shape[2:-1]
+        rows = noise.reshape(*noise.shape[:2], batch.numel(), noise.shape[-1])
+        path = self._path(self._encode(observation, batch), rows)
+        return torch.stack(path).reshape(noise.shape)
 
     def select(self, observation: Tensor | Sequence[Tensor], candidates: Tensor) -> Tensor:
         """The best candidate by the minimum over the critics at level 0.
@@ -187,14 +214,8 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
 
     def _denoise(self, features: Any, noise: Tensor) -> Tensor:
         """Chains of ``noise``, ``(T + 1, N, rows, A)``, a tile of candidates at a time."""
-        levels = torch.arange(self.schedule.num_steps, 0, -1, device=noise.device)
-        candidates = []
-        for tile in noise.split(self._candidates_per_tile(noise[0]), dim=1):
-            action = tile[0]
-            for level, step_noise in zip(levels, tile[1:], strict=True):
-                action = self._step(features, action, step_noise, level)
-            candidates.append(action)
-        return torch.cat(candidates)
+        tiles = noise.split(self._candidates_per_tile(noise[0]), dim=1)
+        return torch.cat([self._path(features, tile)[-1] for tile in tiles])
 
     def _candidates_per_tile(self, candidates: Tensor) -> int:
         """As many candidates of shape ``(N, rows, A)`` as ``tile_rows`` holds.
@@ -207,14 +228,31 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
             return max(num_candidates, 1)
         return max(self.tile_rows // max(num_rows, 1), 1)
 
+    def _path(self, features: Any, noise: Tensor) -> list[Tensor]:
+        """Every step of the chains of ``noise``, from ``a_T`` to ``a_0``."""
+        levels = torch.arange(self.schedule.num_steps, 0, -1, device=noise.device)
+        path = [noise[0]]
+        for level, step_noise in zip(levels, noise[1:], strict=True):
+            path.append(self._step(features, path[-1], step_noise, level))
+        return path
+
+    def _chain_step(
+        self, features: Any, action: Tensor, noise: Tensor, noise_level: Tensor
+    ) -> Tensor:
+        """One step of the chosen sampler."""
+        if self.sampler == "denoising":
+            return self._denoise_step(features, action, noise, noise_level)
+        gradient = self._gradient(features, action, torch.zeros_like(noise_level))
+        return F.langevin_step(
+            action, gradient, self.guidance_weight, self.langevin_step_size, noise
+        )
+
     def _denoise_step(
         self, features: Any, noisy_action: Tensor, noise: Tensor, noise_level: Tensor
     ) -> Tensor:
         """``a_t -> a_{t-1}``; the level is a tensor, so that one compiled step serves them all."""
         index = noise_level - 1 + self.critic.first_level
-        gradient = self.critic.action_gradient(features, noisy_action, index)
-        if self.normalize_gradient:
-            gradient = F.normalize_gradient(gradient)
+        gradient = self._gradient(features, noisy_action, index)
         variance = self.schedule.posterior_variance
         sigma = self.schedule.at(variance, noise_level, noisy_action.dtype).sqrt()
         predicted_noise = F.guided_noise(gradient, self.guidance_weight, sigma)
@@ -222,14 +260,18 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
             noisy_action, predicted_noise, noise, noise_level, clip=self.clip_denoised
         )
 
+    def _gradient(self, features: Any, action: Tensor, index: Tensor) -> Tensor:
+        gradient = self.critic.action_gradient(features, action, index)
+        return F.normalize_gradient(gradient) if self.normalize_gradient else gradient
+
     @property
     def _step(self) -> Callable[..., Tensor]:
-        """The denoising step, compiled once on first use where the actor was built so."""
+        """The sampler's step, compiled once on first use where the actor was built so."""
         if not self.compile_step or torch.compiler.is_compiling():
-            return self._denoise_step
+            return self._chain_step
         if "_compiled_step" not in self.__dict__:
             # Dynamic: acting, targets and evaluation differ in rows and would compile thrice.
-            self.__dict__["_compiled_step"] = torch.compile(self._denoise_step, dynamic=True)
+            self.__dict__["_compiled_step"] = torch.compile(self._chain_step, dynamic=True)
         return self.__dict__["_compiled_step"]
 
     def __getstate__(self) -> dict[str, Any]:
@@ -298,48 +340,3 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         deterministic = exploration_type() not in (None, ExplorationType.RANDOM)
         action = self.sample(observation, batch, deterministic=deterministic)
         return tensordict.set(self.out_keys[0], action)
-
-
-def _check_at_least(least: int, **numbers: float) -> None:
-    for name, number in numbers.items():
-        if not number >= least:  # NaN too
-            raise ValueError(f"Expected {name} >= {least}, got {name}={number}.")
-
-
-def _first_parameter(critic: nn.Module) -> nn.Parameter:
-    for parameter in critic.parameters():
-        return parameter
-    raise ValueError(
-        f"The critic must have parameters to train, got {type(critic).__name__} with none."
-    )
-
-
-def _action_spec(spec: TensorSpec | None, key: NestedKey, action_dim: int | None) -> TensorSpec:
-    """The bounded vector spec of one env's action; an unbounded one where no spec was given."""
-    if spec is None:
-        if action_dim is None:
-            raise ValueError("Pass spec= or action_dim=: the critic does not tell its action_dim.")
-        return Unbounded(shape=(action_dim,))
-    if isinstance(spec, Composite):
-        if key not in spec.keys(True, True):
-            raise ValueError(
-                f"spec must hold the action's key {key!r}, got {list(spec.keys(True, True))}. "
-                "Pass out_keys=[...] to name the action, or the action's own spec."
-            )
-        spec = spec[key]
-    if not isinstance(spec, Bounded) or spec.ndim != 1 or not spec.dtype.is_floating_point:
-        raise ValueError(
-            "spec must be a bounded, continuous action spec of shape (A,), such as "
-            f"env.action_spec_unbatched; got {spec}."
-        )
-    low, high = spec.space.low, spec.space.high
-    if not torch.isfinite(high - low).all() or not (high > low).all():
-        raise ValueError(
-            f"The bounds of the action spec must be finite with low < high, got {low} and {high}. "
-            "Wrap the env so that it declares the range that it uses."
-        )
-    if action_dim not in (None, spec.shape[-1]):
-        raise ValueError(
-            f"The critic has action_dim={action_dim}, the spec {spec.shape[-1]}: they must agree."
-        )
-    return spec

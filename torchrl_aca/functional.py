@@ -18,6 +18,7 @@ __all__ = [
     "add_noise",
     "cosine_betas",
     "guided_noise",
+    "langevin_step",
     "linear_betas",
     "mish_and_slope",
     "noise_level_target",
@@ -91,6 +92,13 @@ def predict_clean(noisy_action: Tensor, noise: Tensor, alpha_cumprod: Tensor) ->
 def posterior_mean(clean: Tensor, noisy_action: Tensor, coef1: Tensor, coef2: Tensor) -> Tensor:
     """Mean of ``q(a_{t-1} | a_t, a_0) = c1_t a_0 + c2_t a_t`` (Ho et al. 2020, eq. 7)."""
     return coef1 * clean + coef2 * noisy_action
+
+
+def langevin_step(
+    action: Tensor, gradient: Tensor, guidance_weight: float, step_size: float, noise: Tensor
+) -> Tensor:
+    """Langevin step ``a + eps/2 w grad_a Q(s, a) + sqrt(eps) z`` (paper, Langevin appendix)."""
+    return action + step_size / 2 * guidance_weight * gradient + math.sqrt(step_size) * noise
 
 
 # --- critic ---------------------------------------------------------------------------------------

@@ -114,7 +114,7 @@ class NoiseSchedule(nn.Module):
         predicted_noise: Tensor,
         noise: Tensor,
         noise_level: Tensor,
-        clip: bool = True,
+        clip: bool | float = True,
     ) -> Tensor:
         """One step of the reverse chain, ``a_t -> a_{t-1}`` (Definition 1 of the paper).
 
@@ -123,7 +123,8 @@ class NoiseSchedule(nn.Module):
             predicted_noise: ``eps_hat``, same shape.
             noise: standard normal draws, broadcastable to that shape.
             noise_level: ``t`` in ``1..T``, an integer tensor of shape ``(*batch,)`` or ``()``.
-            clip: clip the clean estimate to [-1, 1] (official code) or leave it (paper's text).
+            clip: clip the clean estimate to [-1, 1] (official code) or leave it (paper's text); a
+                number ``c`` clips to [-c, c].
 
         Returns:
             ``a_{t-1}`` of shape ``(*batch, A)``.
@@ -139,7 +140,7 @@ class NoiseSchedule(nn.Module):
         )
         # 1. clean estimate   2. its box   3. posterior mean   4. posterior noise
         clean = F.predict_clean(noisy_action, predicted_noise, alpha_cumprod)
-        clean = clean.clamp(-1, 1) if clip else clean
+        clean = clean.clamp(-float(clip), float(clip)) if clip else clean
         return F.posterior_mean(clean, noisy_action, coef1, coef2) + variance.sqrt() * noise
 
     @staticmethod

@@ -1,0 +1,246 @@
+"""The paper's 2D bandit study: three ways to draw actions from a critic, on eight modes.
+
+    python recipes/bandit_2d.py
+    python recipes/bandit_2d.py data=online seeds=[0]
+    python recipes/bandit_2d.py --config-name bandit_2d_ablation
+
+- aca (Diffusion-Q_t): denoising, guided by a critic that knows the noise level;
+- diffusion_q: the same chain, guided by a plain critic Q(s, a);
+- langevin_q: Langevin steps along the plain critic's gradient.
+
+Actions are in the modes' own units, in which a_T ~ N(0, I) lies about their circle: the actor gets
+no spec, so that nothing is scaled. N = 1 and no exploration noise: what counts is the chain alone.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import pickle
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import bandit_tables as tables
+import hydra
+import torch
+from bandit_figures import draw_figures
+from bandit_tables import METHODS, Row
+from omegaconf import DictConfig, OmegaConf
+from torchrl import logger as torchrl_logger
+from torchrl.collectors import Collector
+from torchrl.modules import MLP, ValueOperator
+from tqdm import tqdm
+from two_d_bandit import TwoDBandit, mode_shares, reward
+
+from torchrl_aca import ACALoss, CriticGuidedDenoisingActor, NoiseLevelCritic, NoiseSchedule
+from torchrl_aca.training.data import make_replay_buffer, transitions
+from torchrl_aca.training.errors import RunError
+from torchrl_aca.training.randomness import seed_everything
+from torchrl_aca.training.report import versions
+
+SCHEDULES = ("linear", "cosine", "vp")
+Task = tuple[DictConfig, str, int]  # settings, method, training seed
+
+
+def make_actor(cfg: DictConfig, method: str) -> CriticGuidedDenoisingActor:
+    """The method's sampler on a fresh critic of its own."""
+    chain, num_cells = cfg.chain, list(cfg.critic.num_cells)
+    if method == "aca":
+        critic = NoiseLevelCritic(
+            1, 2, num_steps=chain.num_steps, num_critics=cfg.critic.num_critics, num_cells=num_cells
+        )
+    else:  # a value network that reads no noise level
+        critic = ValueOperator(
+            MLP(3, cfg.critic.num_critics, num_cells=num_cells, activation_class=torch.nn.Mish),
+            in_keys=["observation", "action"],
+        )
+    settings = chain.get(chain.schedule, {})
+    return CriticGuidedDenoisingActor(
+        critic,
+        getattr(NoiseSchedule, chain.schedule)(chain.num_steps, **settings),
+        action_dim=2,
+        guidance_weight=cfg.collector.guidance_weight[method],
+        num_candidates=1,
+        normalize_gradient=chain.normalize_gradient,
+        clip_denoised=chain.clip_denoised,
+        sampler="langevin" if method == "langevin_q" else "denoising",
+        langevin_step_size=chain.langevin_step_size,
+        exploration_noise=0.0,
+    )
+
+
+def train(cfg: DictConfig, method: str, seed: int) -> CriticGuidedDenoisingActor:
+    """Trains the method's critic on random actions, or on those that the method draws itself."""
+    seed_everything(seed)
+    actor, collection = make_actor(cfg, method), cfg.collector
+    # Every episode ends with its first step, so the target is the reward and nothing bootstraps.
+    loss = ACALoss(actor, reward_scale=1.0, delay_qvalue=False)
+    optimizer = torch.optim.Adam(actor.critic.parameters(), lr=cfg.optim.lr)
+    num_updates = collection.frames // collection.frames_per_batch * cfg.optim.updates_per_batch
+    scheduler = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, num_updates)
+    buffer = make_replay_buffer(collection.frames, cfg.optim.batch_size)
+    collector = Collector(
+        TwoDBandit(collection.frames_per_batch, collection.half_width),
+        actor,
+        frames_per_batch=collection.frames_per_batch,
+        total_frames=collection.frames,
+        init_random_frames=collection["frames" if cfg.data == "uniform" else "init_random_frames"],
+        auto_register_policy_transforms=False,
+    )
+    for data in collector:
+        buffer.extend(transitions(data))
+        for _ in range(cfg.optim.updates_per_batch):
+            batch = buffer.sample()
+            batch["next_action"] = batch["action"]  # the last step needs none: spare the chain
+            objective = loss.qvalue_loss(batch)["loss_qvalue"]
+            if method == "aca":
+                objective = objective + loss.noise_level_loss(batch)["loss_noise_level"]
+            optimizer.zero_grad()
+            objective.backward()
+            optimizer.step()
+            scheduler.step()
+    collector.shutdown()
+    return actor
+
+
+def draw(actor: CriticGuidedDenoisingActor, num_samples: int) -> torch.Tensor:
+    """Samples of shape (num_samples, 2), in the mode of acting."""
+    return actor.sample(torch.zeros(num_samples, 1), [num_samples])
+
+
+def measure(actions: torch.Tensor) -> Row:
+    """The numbers of the paper's table, and the rewards' mean and standard deviation."""
+    shares, rewards = mode_shares(actions), reward(actions)
+    moments = {"reward_mean": rewards.mean().item(), "reward_std": rewards.std().item()}
+    return {**shares, "sum": sum(shares.values()), **moments}
+
+
+def sweep(cfg: DictConfig, actor: CriticGuidedDenoisingActor) -> list[Row]:
+    """Measures every guidance weight, and leaves the actor with the most rewarding one."""
+    rows = []
+    for weight in cfg.sweep.weights:
+        actor.guidance_weight = weight
+        rows.append({"weight": weight, **measure(draw(actor, cfg.sweep.num_samples))})
+    actor.guidance_weight = max(rows, key=lambda row: row["reward_mean"])["weight"]
+    return rows
+
+
+def combinations(options: Mapping[str, Sequence[Any]]) -> list[Row]:
+    """Every way to choose one value for each key; the empty choice where there are no keys."""
+    return [dict(zip(options, values, strict=True)) for values in product(*options.values())]
+
+
+def run(task: Task) -> tuple[list[Row], list[Row], bytes]:
+    """Reported rows, the sweeps' rows, and the actor: as bytes, to leave a worker process."""
+    cfg, method, seed = task
+    torch.set_num_threads(cfg.num_threads)
+    torchrl_logger.setLevel("WARNING")  # its notes about storages would break the progress bar
+    actor = train(cfg, method, seed)
+    reported, swept = [], []
+    for changed in combinations(cfg.ablation.sampling):
+        for name, value in changed.items():
+            setattr(actor, name, value)
+        label = {"method": method, "seed": seed, **changed}
+        swept += [{**label, **row} for row in sweep(cfg, actor)]
+        fresh = measure(draw(actor, cfg.report.num_samples))
+        reported.append({**label, "weight": actor.guidance_weight, **fresh})
+    return reported, swept, pickle.dumps(actor)
+
+
+def run_all(
+    tasks: Sequence[Task], num_workers: int
+) -> Iterator[tuple[list[Row], list[Row], bytes]]:
+    """Yields the results of all tasks in order, behind a progress bar."""
+    bar = partial(tqdm, total=len(tasks), unit="run", desc="train, sweep, sample")
+    if num_workers == 1:
+        yield from bar(map(run, tasks))
+    else:
+        with multiprocessing.get_context("spawn").Pool(num_workers) as pool:
+            yield from bar(pool.imap(run, tasks))
+
+
+def study(cfg: DictConfig, run_dir: Path) -> None:
+    """Runs all methods and seeds; writes the tables and, where asked for, the figures."""
+    tasks = [(cfg, method, seed) for method in cfg.methods for seed in cfg.seeds]
+    reported, swept, actors = [], [], {}
+    for (_, method, _), (rows, sweep_rows, actor) in zip(
+        tasks, run_all(tasks, cfg.num_workers), strict=True
+    ):
+        reported += rows
+        swept += sweep_rows
+        actors.setdefault(method, pickle.loads(actor))
+    table = tables.summary(reported)
+    for name, rows in (("seeds", reported), ("sweep", swept), ("table", table)):
+        tables.write_csv(run_dir / f"{name}.csv", rows)
+    print(tables.as_text(table))
+    if cfg.figures:
+        draw_figures(run_dir, actors, reported, swept)
+
+
+def ablate(cfg: DictConfig, run_dir: Path) -> None:
+    """One row for each combination of the ablation's values, each method and each seed."""
+    tasks, settings = [], []
+    for changed in combinations(cfg.ablation.training):
+        variant = cfg.copy()
+        for key, value in changed.items():
+            OmegaConf.update(variant, key, value)
+        for method, seed in product(cfg.methods, cfg.seeds):
+            tasks.append((variant, method, seed))
+            settings.append(changed)
+    table = []
+    for changed, (rows, *_) in zip(settings, run_all(tasks, cfg.num_workers), strict=True):
+        table += [{**changed, **row} for row in rows]
+    tables.write_csv(run_dir / "ablation.csv", table)
+    compact = tables.side_by_side(table, [*cfg.ablation.training, *cfg.ablation.sampling])
+    tables.write_csv(run_dir / "ablation_table.csv", compact)
+    print(tables.as_text(compact))
+
+
+def validate(cfg: DictConfig) -> None:
+    """Checks what would otherwise fail late or pass unseen.
+
+    Raises:
+        RunError: naming the key, what was expected and what was got.
+    """
+    frames, size, weights = cfg.collector.frames, cfg.collector.frames_per_batch, cfg.sweep.weights
+    checks = {
+        "data": (cfg.data in ("uniform", "online"), "uniform or online"),
+        "chain.schedule": (cfg.chain.schedule in SCHEDULES, f"one of {SCHEDULES}"),
+        "methods": (cfg.methods and set(cfg.methods) <= set(METHODS), f"some of {list(METHODS)}"),
+        "seeds": (cfg.seeds, "at least one seed"),
+        "sweep.weights": (weights and min(weights) >= 0, "weights of at least 0"),
+        "collector.frames": (frames % size == 0, f"a multiple of frames_per_batch, {size}"),
+    }
+    for key, (fits, what) in checks.items():
+        if not fits:
+            raise RunError(f"{key}={OmegaConf.select(cfg, key)}: expected {what}. Set {key}=... .")
+
+
+@hydra.main(version_base="1.3", config_path="configs", config_name="bandit_2d")
+def main(cfg: DictConfig) -> None:
+    """Runs the study or its ablation into a new directory."""
+    run_dir = Path(cfg.run_dir or Path("runs") / f"bandit_2d-{time.strftime('%Y%m%d-%H%M%S')}")
+    try:
+        validate(cfg)
+        if (run_dir / "config.yaml").exists():
+            raise RunError(f"run_dir={run_dir} already holds a run; expected a new directory.")
+    except RunError as error:
+        raise SystemExit(f"error: {error}") from None
+    run_dir.mkdir(parents=True, exist_ok=True)
+    (run_dir / "config.yaml").write_text(OmegaConf.to_yaml(cfg))
+    start = time.perf_counter()
+    (ablate if cfg.ablation.training else study)(cfg, run_dir)
+    minutes = round((time.perf_counter() - start) / 60, 1)
+    command = " ".join(["python", *sys.argv])
+    tables.write_card(
+        run_dir, {"command": command, "wall-clock time": f"{minutes} min", **versions()}
+    )
+    print(f"run directory: {run_dir}")
+
+
+if __name__ == "__main__":
+    main()
