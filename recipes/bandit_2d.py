@@ -232,13 +232,11 @@ def main(cfg: DictConfig) -> None:
         raise SystemExit(f"error: {error}") from None
     run_dir.mkdir(parents=True, exist_ok=True)
     (run_dir / "config.yaml").write_text(OmegaConf.to_yaml(cfg))
-    start = time.perf_counter()
+    start, info = time.perf_counter(), versions()
     (ablate if cfg.ablation.training else study)(cfg, run_dir)
     minutes = round((time.perf_counter() - start) / 60, 1)
     command = " ".join(["python", *sys.argv])
-    tables.write_card(
-        run_dir, {"command": command, "wall-clock time": f"{minutes} min", **versions()}
-    )
+    tables.write_card(run_dir, {"command": command, "wall-clock time": f"{minutes} min", **info})
     print(f"run directory: {run_dir}")
 
 
