@@ -28,6 +28,7 @@ def flops(rows: int, action_dim: int) -> float:
 
 
 def make_actor(size: str, variant: str, num_candidates: int) -> CriticGuidedDenoisingActor:
+    torch._dynamo.reset()  # it compiles a method for a few objects only, and then no more
     return CriticGuidedDenoisingActor(
         NoiseLevelCritic(*SIZES[size]),
         NoiseSchedule.cosine(NUM_STEPS),

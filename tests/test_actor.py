@@ -556,6 +556,28 @@ def test_compiles_without_a_graph_break():
     assert act(compiled, td).shape == (BATCH, ACTION)  # with fresh draws it compiles as well
 
 
+def test_one_compiled_step_serves_acting_targets_and_evaluation(monkeypatch):
+    torch._dynamo.reset()
+    compiled = []
+
+    def counting_backend(graph, inputs):
+        compiled.append(graph)
+        return graph.forward
+
+    torch_compile = torch.compile
+    monkeypatch.setattr(
+        torch, "compile", lambda f, **kwargs: torch_compile(f, backend=counting_backend, **kwargs)
+    )
+    actor = make_actor(compile_step=True, num_candidates=32, tile_rows=64)
+    for num_states, num_candidates in [(5, 32), (50, 32), (10, 32), (16, 8), (5, 4)]:
+        observation = torch.randn(num_states, OBS)
+        actor.sample(observation, [num_states], num_candidates=num_candidates)
+        with torch.no_grad(), DETERMINISTIC:
+            act(actor, observe(num_states))
+    # Batches of one candidate have a version of their own: 50 states fill a tile.
+    assert len(compiled) == 2
+
+
 def test_a_compiled_step_acts_alike_at_every_level_and_stays_behind_in_copies(monkeypatch):
     compiled_steps = []
 

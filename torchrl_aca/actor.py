@@ -65,7 +65,7 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         clip_action: clip the action to the spec's bounds. Default: False; as in the official
             code, exploration noise may leave the box, and the loss learns from such actions.
         compile_step: run the denoising step through ``torch.compile``: seconds of compilation at
-            the first call of each shape, faster steps afterwards. Default: False.
+            the first call, faster steps afterwards, for any number of rows. Default: False.
         tile_rows: rows (states times candidates) that a CPU takes through the chain at once. It
             changes cost and memory, not the result. Default: 1024.
         in_keys: keys of the observations. Default: those of the critic.
@@ -264,15 +264,16 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         gradient = self.critic.action_gradient(features, action, index)
         return F.normalize_gradient(gradient) if self.normalize_gradient else gradient
 
-    @property
-    def _step(self) -> Callable[..., Tensor]:
-        """The sampler's step, compiled once on first use where the actor was built so."""
+    def _step(self, features: Any, action: Tensor, noise: Tensor, noise_level: Tensor) -> Tensor:
+        """The sampler's step, compiled on first use where the actor was built so."""
         if not self.compile_step or torch.compiler.is_compiling():
-            return self._chain_step
+            return self._chain_step(features, action, noise, noise_level)
         if "_compiled_step" not in self.__dict__:
-            # Dynamic: acting, targets and evaluation differ in rows and would compile thrice.
             self.__dict__["_compiled_step"] = torch.compile(self._chain_step, dynamic=True)
-        return self.__dict__["_compiled_step"]
+        # Dynamic, and on copies: acting, targets and evaluation differ in rows, and what is compiled
+        # for a view depends on the tensor behind it. Each would be compiled anew.
+        inputs = (tensor.clone() for tensor in (action, noise, noise_level))
+        return self.__dict__["_compiled_step"](features, *inputs)
 
     def __getstate__(self) -> dict[str, Any]:
         """Copies and workers compile for themselves: compiled code does not travel."""
