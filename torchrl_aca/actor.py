@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
@@ -270,7 +270,7 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
             return self._chain_step(features, action, noise, noise_level)
         if "_compiled_step" not in self.__dict__:
             self.__dict__["_compiled_step"] = torch.compile(self._chain_step, dynamic=True)
-        # Dynamic, and on copies: acting, targets and evaluation differ in rows, and what is compiled
+        # Dynamic, and on copies: acting, targets and evaluation differ in rows, and code compiled
         # for a view depends on the tensor behind it. Each would be compiled anew.
         inputs = (tensor.clone() for tensor in (action, noise, noise_level))
         return self.__dict__["_compiled_step"](features, *inputs)
