@@ -653,13 +653,14 @@ def test_a_spawned_worker_acts_as_the_learner_before_and_after_an_update(
         return actor.sample(batch["observation"], batch.shape, deterministic=True)
 
     first = next(batches).clone()
-    torch.testing.assert_close(first["action"], learners_action(first), rtol=0, atol=1e-5)
+    # One state against a batch of eight rounds differently, and the chain amplifies it.
+    torch.testing.assert_close(first["action"], learners_action(first), rtol=0, atol=1e-3)
     with torch.no_grad():
         actor.critic.value.weight.neg_()
     collector.update_policy_weights_()
     next(batches)  # may have begun before the update
     later = next(batches).clone()
-    torch.testing.assert_close(later["action"], learners_action(later), rtol=0, atol=1e-5)
+    torch.testing.assert_close(later["action"], learners_action(later), rtol=0, atol=1e-3)
     assert not torch.allclose(first["action"], learners_action(first), atol=1e-2)
 
 
