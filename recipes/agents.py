@@ -40,16 +40,15 @@ SCHEDULES = {
 }
 
 
-def make_aca(cfg: DictConfig, env: EnvBase, device: torch.device) -> Agent:
-    """ACA, in the official code's order: a TD step, then at even updates a noise-level step."""
-    settings, optim = cfg.aca, cfg.optim
+def make_aca_loss(cfg: DictConfig, env: EnvBase, device: torch.device) -> ACALoss:
+    """The critic, the actor that it guides, and their loss."""
+    settings = cfg.aca
     schedule = SCHEDULES.get(settings.schedule)
     if schedule is None:
         raise ValueError(f"aca.schedule={settings.schedule}: expected one of {list(SCHEDULES)}.")
-    observation_dim = env.observation_spec["observation"].shape[-1]
     action_spec = env.action_spec_unbatched
     critic = NoiseLevelCritic(
-        observation_dim,
+        env.observation_spec["observation"].shape[-1],
         action_spec.shape[-1],
         num_steps=settings.num_steps,
         num_critics=settings.num_critics,
@@ -74,9 +73,16 @@ def make_aca(cfg: DictConfig, env: EnvBase, device: torch.device) -> Agent:
         target_entropy_scale=settings.target_entropy_scale,
         reward_scale=settings.reward_scale,
     )
-    loss.make_value_estimator(gamma=optim.gamma)
+    loss.make_value_estimator(gamma=cfg.optim.gamma)
+    return loss
+
+
+def make_aca(cfg: DictConfig, env: EnvBase, device: torch.device) -> Agent:
+    """ACA, in the official code's order: a TD step, then at even updates a noise-level step."""
+    settings, optim = cfg.aca, cfg.optim
+    loss = make_aca_loss(cfg, env, device)
     target_update = SoftUpdate(loss, tau=optim.tau)
-    optimizer = torch.optim.Adam(critic.parameters(), lr=optim.lr)
+    optimizer = torch.optim.Adam(loss.qvalue_network.parameters(), lr=optim.lr)
     alpha_optimizer = torch.optim.Adam([loss.log_alpha], lr=optim.alpha_lr)
     # The decay counts steps of the optimiser, of which an update takes one or two.
     scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, partial(lr_factor, optim))
@@ -101,7 +107,7 @@ def make_aca(cfg: DictConfig, env: EnvBase, device: torch.device) -> Agent:
         return metrics
 
     return Agent(
-        actor,
+        loss.actor_network,
         update,
         state={
             "loss": loss,
