@@ -1,7 +1,7 @@
 """The paper's 2D bandit study: three ways to draw actions from a critic, on eight modes.
 
     python recipes/bandit_2d.py
-    python recipes/bandit_2d.py data=online seeds=[0]
+    python recipes/bandit_2d.py data=uniform seeds=[0]
     python recipes/bandit_2d.py --config-name bandit_2d_ablation
 
 - aca (Diffusion-Q_t): denoising, guided by a critic that knows the noise level;
@@ -207,13 +207,18 @@ def validate(cfg: DictConfig) -> None:
         RunError: naming the key, what was expected and what was got.
     """
     frames, size, weights = cfg.collector.frames, cfg.collector.frames_per_batch, cfg.sweep.weights
-    checks = {
+    sizes = ("collector.frames_per_batch", "optim.batch_size", "num_workers", "num_threads")
+    checks: dict[str, tuple[Any, str]] = {
+        **{key: (OmegaConf.select(cfg, key) >= 1, "at least 1") for key in sizes},
         "data": (cfg.data in ("uniform", "online"), "uniform or online"),
         "chain.schedule": (cfg.chain.schedule in SCHEDULES, f"one of {SCHEDULES}"),
         "methods": (cfg.methods and set(cfg.methods) <= set(METHODS), f"some of {list(METHODS)}"),
         "seeds": (cfg.seeds, "at least one seed"),
         "sweep.weights": (weights and min(weights) >= 0, "weights of at least 0"),
-        "collector.frames": (frames % size == 0, f"a multiple of frames_per_batch, {size}"),
+        "collector.frames": (
+            frames > 0 and frames % max(size, 1) == 0,
+            f"a multiple of frames_per_batch, {size}",
+        ),
     }
     for key, (fits, what) in checks.items():
         if not fits:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from typing import Any, Literal
@@ -56,7 +57,7 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         num_candidates: ``N``. Default: 32.
         normalize_gradient: guide by the unit gradient. Default: True.
         clip_denoised: clip the clean estimate to [-1, 1] in every step, or to [-c, c] for a number
-            ``c``. Langevin steps make no clean estimate to clip. Default: True.
+            ``c``; False or 0 leaves it. Langevin steps make no clean estimate. Default: True.
         sampler: ``"denoising"`` or ``"langevin"``. Default: ``"denoising"``.
         langevin_step_size: ``eps`` of the Langevin step. Default: 1e-3.
         exploration_noise: standard deviation of the exploration noise at ``alpha = 1``, in critic
@@ -66,8 +67,8 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
             code, exploration noise may leave the box, and the loss learns from such actions.
         compile_step: run the denoising step through ``torch.compile``: seconds of compilation at
             the first call, faster steps afterwards, for any number of rows. Default: False.
-        tile_rows: rows (states times candidates) that a CPU takes through the chain at once. It
-            changes cost and memory, not the result. Default: 1024.
+        tile_rows: rows (states times candidates) that a CPU takes through the chain at once, at
+            least one candidate of every state. It changes cost, not the result. Default: 1024.
         in_keys: keys of the observations. Default: those of the critic.
         out_keys: the action's key.
 
@@ -121,7 +122,8 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
                 f"{schedule.num_steps}. Build both with the same number."
             )
         anchor = first_parameter(self.critic)
-        self.schedule = schedule.to(anchor.device)
+        # A copy: `to` works in place, and the schedule may serve actors on other devices too.
+        self.schedule = copy.deepcopy(schedule).to(anchor.device)
         self.guidance_weight = guidance_weight
         self.num_candidates = num_candidates
         self.normalize_gradient = normalize_gradient
