@@ -459,6 +459,16 @@ def test_bounds_must_be_finite(high):
         make_actor(spec=box)
 
 
+def test_a_missing_observation_is_named():
+    with pytest.raises(KeyError, match="observation"):
+        make_actor()(TensorDict(state=torch.zeros(2, OBS), batch_size=[2]))
+
+
+def test_a_call_without_candidates_is_refused():
+    with pytest.raises(ValueError, match="num_candidates >= 1, got num_candidates=0"):
+        make_actor().sample(torch.zeros(2, OBS), [2], num_candidates=0)
+
+
 @pytest.mark.parametrize(
     "bad",
     [
@@ -653,7 +663,7 @@ def test_a_spawned_worker_acts_as_the_learner_before_and_after_an_update(
         return actor.sample(batch["observation"], batch.shape, deterministic=True)
 
     first = next(batches).clone()
-    # One state against a batch of eight rounds differently, and the chain amplifies it.
+    # The worker need not round as this process does (3e-5 has been seen).
     torch.testing.assert_close(first["action"], learners_action(first), rtol=0, atol=1e-3)
     with torch.no_grad():
         actor.critic.value.weight.neg_()

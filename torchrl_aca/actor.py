@@ -307,11 +307,13 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
             deterministic: fixed draws and no exploration noise.
 
         Raises:
-            ValueError: if ``num_candidates`` exceeds the actor's in a deterministic call.
+            ValueError: if ``num_candidates`` is below 1, or exceeds the actor's in a deterministic
+                call.
         """
         batch = torch.Size(batch)
         num_rows = batch.numel()
         num_chains = self.num_candidates if num_candidates is None else num_candidates
+        check_at_least(1, num_candidates=num_chains)
         features = self._encode(observation, batch)
         draws = self._draws(num_chains, num_rows, deterministic)
         action = self._select(features, self._denoise(features, draws[:-1]))
@@ -338,7 +340,7 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action for observations of any batch shape, ``()`` included."""
-        observation = [tensordict.get(key) for key in self.in_keys]
+        observation = [tensordict[key] for key in self.in_keys]
         batch = self.critic.batch_shape(observation, tensordict.batch_size)
         deterministic = exploration_type() not in (None, ExplorationType.RANDOM)
         action = self.sample(observation, batch, deterministic=deterministic)

@@ -87,11 +87,11 @@ class NoiseLevelCriticBase(TensorDictModuleBase):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``value_key`` for the observations, actions and noise levels of any batch shape."""
-        action = tensordict.get(self.action_key)
+        action = tensordict[self.action_key]
         batch = action.shape[:-1]
-        observations = [tensordict.get(key) for key in self.observation_keys]
+        observations = [tensordict[key] for key in self.observation_keys]
         rows = [o.reshape(-1, *o.shape[len(batch) :]) for o in observations]
-        level = tensordict.get(self.noise_level_key).expand(batch).reshape(-1)
+        level = tensordict[self.noise_level_key].expand(batch).reshape(-1)
         value = self.evaluate(self.encode(*rows), action.reshape(-1, action.shape[-1]), level)
         return tensordict.set(self.value_key, value.reshape(*batch, value.shape[-1]))
 

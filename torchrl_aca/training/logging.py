@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -39,7 +40,7 @@ class MetricMeans:
         means = {name: (total / self.counts[name]).item() for name, total in self.sums.items()}
         self.sums, self.counts = {}, {}
         for name, value in means.items():
-            if not torch.isfinite(torch.tensor(value)):
+            if not math.isfinite(value):
                 raise RunError(
                     f"the metric {name!r} became {value}; expected a finite number. The training "
                     "has diverged: lower optim.lr or the reward scale, and resume or start again."
