@@ -132,7 +132,10 @@ def make_sac(cfg: DictConfig, env: EnvBase, device: torch.device) -> Agent:
     action_spec = env.action_spec_unbatched
     observation_dim = env.observation_spec["observation"].shape[-1]
     action_dim = action_spec.shape[-1]
-    mlp = {"num_cells": list(settings.num_cells), "activation_class": nn.GELU, "device": device}
+    activation = getattr(nn, settings.activation, None)
+    if activation is None:
+        raise ValueError(f"sac.activation={settings.activation}: expected a class of torch.nn.")
+    mlp = {"num_cells": list(settings.num_cells), "activation_class": activation, "device": device}
     actor_network = nn.Sequential(
         MLP(in_features=observation_dim, out_features=2 * action_dim, **mlp),
         BoundedNormalParams(settings.log_std_min, settings.log_std_max),

@@ -83,6 +83,7 @@ def train(cfg: DictConfig, checkpoint: dict[str, Any] | None = None) -> Path:
                 run.log_metrics({**episodes.metrics(), **means.pop()})
             if counters.passed(cfg.eval.interval, since=start) or last:
                 run.log_evaluation(evaluate(agent.policy, eval_env, cfg.eval.seed, device))
+                last = last or run.has_reached(cfg.eval.stop_return)
             if counters.passed(cfg.checkpoint.interval, since=start):
                 run.save()
             run.show_progress()

@@ -46,6 +46,8 @@ def validate(cfg: DictConfig, algorithms: Iterable[str]) -> None:
         value = OmegaConf.select(cfg, key)
         fits = isinstance(value, int | float) and low < value <= high
         _require(fits, cfg, key, f"a number above {low}, at most {high}")
+    stop = cfg.eval.stop_return
+    _require(stop is None or isinstance(stop, int | float), cfg, "eval.stop_return", "a number")
     if cfg.num_threads is not None:
         fits = isinstance(cfg.num_threads, int) and cfg.num_threads > 0
         _require(fits, cfg, "num_threads", "a positive integer or null")
