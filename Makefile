@@ -2,7 +2,7 @@
 # the environment in .venv, caches in .cache.
 
 PYTHON ?= python3
-EXTRAS ?= recipes,docs,dev
+EXTRAS ?= recipes,offline,docs,dev
 SHELL := bash
 .DEFAULT_GOAL := help
 
