@@ -125,7 +125,7 @@ def pins() -> dict[str, str]:
 
 
 EXTRAS = PROJECT["optional-dependencies"]
-PINNED_EXTRAS = ("recipes", "docs", "dev")
+PINNED_EXTRAS = ("recipes", "offline", "docs", "dev")
 REQUIREMENTS = [
     requirement
     for group in (PROJECT["dependencies"], *(EXTRAS[extra] for extra in PINNED_EXTRAS))
