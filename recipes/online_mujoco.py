@@ -118,10 +118,16 @@ def make_device(cfg: DictConfig) -> torch.device:
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
     try:
-        return torch.empty(0, device=name).device
+        device = torch.empty(0, device=name).device
     except (RuntimeError, AssertionError) as error:
         message = str(error).splitlines()[0]
         raise RunError(f"device={name}: {message}. Use device=cpu or device=auto.") from error
+    if cfg.cudagraphs and device.type != "cuda":
+        raise RunError(
+            f"cudagraphs=true: expected device=cuda, got {device}. Leave it out on a CPU; "
+            "compile=true works there."
+        )
+    return device
 
 
 def make_collector(

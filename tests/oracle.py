@@ -136,6 +136,26 @@ def denoise(
     return x
 
 
+def ddim_chain(
+    critics, obs, initial_noise, step_noise, sched, levels, weight=50.0, first_level=1, unit=True
+):
+    """As ``denoise`` over ``levels`` (rising) alone, in the form of DDIM's equation 12, eta = 1."""
+    x, cumprod = np.asarray(initial_noise, dtype=float), sched["alphas_cumprod"]
+    for i, noise in zip(range(len(levels) - 1, -1, -1), step_noise, strict=True):
+        now, after = cumprod[levels[i] - 1], cumprod[levels[i - 1] - 1] if i else 1.0
+        gradient = sum(
+            critic_action_gradient(q, obs, x, levels[i] - 1 + first_level) for q in critics
+        )
+        gradient = normalize(gradient) if unit else gradient
+        guided = guided_noise(gradient, sched["posterior_variance"][levels[i] - 1], weight)
+        clean = np.clip(predict_clean(x, guided, now), -1, 1)
+        direction = (x - np.sqrt(now) * clean) / np.sqrt(1 - now)
+        variance = (1 - after) / (1 - now) * (1 - now / after)
+        rest = np.sqrt(np.maximum(1 - after - variance, 0))
+        x = np.sqrt(after) * clean + rest * direction + np.sqrt(variance) * noise
+    return x
+
+
 def langevin(critics, obs, initial_noise, step_noise, weight=50.0, step_size=1e-3, unit=True):
     """As ``denoise``, by Langevin steps along the gradient at the clean level 0."""
     x = np.asarray(initial_noise, dtype=float)

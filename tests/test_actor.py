@@ -86,6 +86,43 @@ def test_denoise_equals_the_oracle(first_level, unit, schedules, clip, weight):
 
 @pytest.mark.parametrize("first_level", [0, 1])
 @pytest.mark.parametrize("unit", [True, False])
+@pytest.mark.parametrize("levels", [[1, 6], [1, 3, 6], [1, 2, 3, 5, 6], [1, 2, 3, 4, 5, 6]])
+def test_a_chain_of_fewer_steps_equals_ddim_on_these_levels(levels, unit, first_level):
+    critic = make_critic(first_level=first_level, dtype=torch.float64)
+    actor = make_actor(critic, num_inference_steps=len(levels), normalize_gradient=unit)
+    observation = torch.randn(BATCH, OBS, dtype=torch.float64)
+    noise = torch.randn(len(levels) + 1, CANDIDATES, BATCH, ACTION, dtype=torch.float64)
+    expected = oracle.ddim_chain(
+        to_official(critic), observation.numpy(), noise[0].numpy(), noise[1:].numpy(),
+        oracle.schedule(oracle.cosine_betas(T)), levels, 50.0, first_level, unit,
+    )  # fmt: skip
+    assert actor.chain_schedule.noise_levels.tolist() == levels
+    np.testing.assert_allclose(actor.denoise(observation, noise), expected, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("steps", [1, T + 1, -2, 2.5])
+def test_number_of_inference_steps_must_fit_the_levels(steps):
+    with pytest.raises(ValueError, match=f"from 2 to {T}, got {steps}"):
+        make_actor(num_inference_steps=steps)
+
+
+def test_fewer_steps_ask_the_critic_less_often_and_act_in_every_way(monkeypatch):
+    actor = make_actor(num_inference_steps=3)
+    asked, gradient = [], actor.critic.action_gradient
+    monkeypatch.setattr(
+        actor.critic,
+        "action_gradient",
+        lambda *args: asked.append(args[2].item()) or gradient(*args),
+    )
+    td = observe(BATCH)
+    assert act(actor, td).shape == (BATCH, ACTION)
+    assert asked == [6, 3]  # not at level 1, where sigma is 0
+    with DETERMINISTIC:
+        torch.testing.assert_close(act(actor, td), act(actor, td), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("first_level", [0, 1])
+@pytest.mark.parametrize("unit", [True, False])
 def test_langevin_sampler_equals_the_oracle(first_level, unit):
     critic = make_critic(first_level=first_level, dtype=torch.float64)
     actor = make_actor(

@@ -46,7 +46,7 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
     Args:
         critic: a :class:`NoiseLevelCritic`, or a network of one's own (see :class:`CustomCritic`).
             ``actor.critic`` holds the very parameters that the loss trains.
-        schedule: the diffusion's constants; its ``T`` is the length of the chain.
+        schedule: the diffusion's constants; its ``T`` is the number of noise levels.
 
     Keyword Args:
         spec: bounded action spec of one env (``env.action_spec_unbatched``), or a ``Composite``
@@ -55,6 +55,9 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
             ``action_dim`` of its own.
         guidance_weight: ``w``. Default: 50.
         num_candidates: ``N``. Default: 32.
+        num_inference_steps: number ``S`` of steps of the chain, from 2 to ``T``. Fewer than ``T``
+            visit every few levels only (:meth:`NoiseSchedule.strided`): cheaper, and not quite the
+            same distribution. Default: ``T``, the paper's chain.
         normalize_gradient: guide by the unit gradient. Default: True.
         clip_denoised: clip the clean estimate to [-1, 1] in every step, or to [-c, c] for a number
             ``c``; False or 0 leaves it. Langevin steps make no clean estimate. Default: True.
@@ -96,6 +99,7 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         action_dim: int | None = None,
         guidance_weight: float = 50.0,
         num_candidates: int = 32,
+        num_inference_steps: int | None = None,
         normalize_gradient: bool = True,
         clip_denoised: bool | float = True,
         sampler: Literal["denoising", "langevin"] = "denoising",
@@ -124,6 +128,8 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         anchor = first_parameter(self.critic)
         # A copy: `to` works in place, and the schedule may serve actors on other devices too.
         self.schedule = copy.deepcopy(schedule).to(anchor.device)
+        self.num_inference_steps = num_inference_steps or schedule.num_steps
+        self.chain_schedule = self.schedule.strided(self.num_inference_steps)
         self.guidance_weight = guidance_weight
         self.num_candidates = num_candidates
         self.normalize_gradient = normalize_gradient
@@ -145,7 +151,7 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         low, high = torch.full(leaf.shape, -1.0), torch.full(leaf.shape, 1.0)
         if spec is not None:
             low, high = leaf.space.low, leaf.space.high
-        shape = (schedule.num_steps + 1, num_candidates, self.action_dim)
+        shape = (self.num_inference_steps + 1, num_candidates, self.action_dim)
         constants = {
             "center": (high + low) / 2,
             "half_range": (high - low) / 2,
@@ -172,7 +178,7 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         Args:
             observation: the observation of shape ``(*batch, O)``, or one tensor for each of
                 ``in_keys``.
-            noise: standard normal draws of shape ``(T + 1, N, *batch, A)``: row 0 is ``a_T``, row
+            noise: standard normal draws of shape ``(S + 1, N, *batch, A)``: row 0 is ``a_T``, row
                 ``k`` belongs to the ``k``-th step; denoising multiplies the last row by zero, the
                 Langevin sampler adds noise in every step.
 
@@ -184,7 +190,7 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         return self._denoise(self._encode(observation, batch), rows).reshape(noise.shape[1:])
 
     def trajectory(self, observation: Tensor | Sequence[Tensor], noise: Tensor) -> Tensor:
-        """As :meth:`denoise`, with every step kept: ``a_T .. a_0``, shape ``(T+1, N, *batch, A)``.
+        """As :meth:`denoise`, with every step kept: ``a_T .. a_0``, shape ``(S+1, N, *batch, A)``.
 
         Args:
             observation: as in :meth:`denoise`.
@@ -215,7 +221,7 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         return self.critic.encode(*rows)
 
     def _denoise(self, features: Any, noise: Tensor) -> Tensor:
-        """Chains of ``noise``, ``(T + 1, N, rows, A)``, a tile of candidates at a time."""
+        """Chains of ``noise``, ``(S + 1, N, rows, A)``, a tile of candidates at a time."""
         tiles = noise.split(self._candidates_per_tile(noise[0]), dim=1)
         return torch.cat([self._path(features, tile)[-1] for tile in tiles])
 
@@ -232,49 +238,56 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
 
     def _path(self, features: Any, noise: Tensor) -> list[Tensor]:
         """Every step of the chains of ``noise``, from ``a_T`` to ``a_0``."""
-        levels = torch.arange(self.schedule.num_steps, 0, -1, device=noise.device)
+        steps = torch.arange(self.num_inference_steps, 0, -1, device=noise.device)
         path = [noise[0]]
-        for level, step_noise in zip(levels, noise[1:], strict=True):
-            path.append(self._step(features, path[-1], step_noise, level))
+        for step, step_noise in zip(steps, noise[1:], strict=True):
+            last = len(path) == self.num_inference_steps
+            take = self._last_step if last and self.sampler == "denoising" else self._step
+            path.append(take(features, path[-1], step_noise, step))
         return path
 
-    def _chain_step(
-        self, features: Any, action: Tensor, noise: Tensor, noise_level: Tensor
-    ) -> Tensor:
+    def _chain_step(self, features: Any, action: Tensor, noise: Tensor, step: Tensor) -> Tensor:
         """One step of the chosen sampler."""
         if self.sampler == "denoising":
-            return self._denoise_step(features, action, noise, noise_level)
-        gradient = self._gradient(features, action, torch.zeros_like(noise_level))
+            return self._denoise_step(features, action, noise, step)
+        gradient = self._gradient(features, action, torch.zeros_like(step))
         return F.langevin_step(
             action, gradient, self.guidance_weight, self.langevin_step_size, noise
         )
 
-    def _denoise_step(
-        self, features: Any, noisy_action: Tensor, noise: Tensor, noise_level: Tensor
-    ) -> Tensor:
-        """``a_t -> a_{t-1}``; the level is a tensor, so that one compiled step serves them all."""
-        index = noise_level - 1 + self.critic.first_level
-        gradient = self._gradient(features, noisy_action, index)
+    def _denoise_step(self, features: Any, action: Tensor, noise: Tensor, step: Tensor) -> Tensor:
+        """One guided step; its number is a tensor, so that one compiled step serves them all."""
+        level = self.chain_schedule.noise_levels.index_select(0, step.reshape(-1) - 1)
+        level = level.reshape(step.shape)
+        index = level - 1 + self.critic.first_level
+        gradient = self._gradient(features, action, index)
+        # Guided as at this level of the whole chain, however long the stride from here.
         variance = self.schedule.posterior_variance
-        sigma = self.schedule.at(variance, noise_level, noisy_action.dtype).sqrt()
+        sigma = self.schedule.at(variance, level, action.dtype).sqrt()
         predicted_noise = F.guided_noise(gradient, self.guidance_weight, sigma)
-        return self.schedule.denoise_step(
-            noisy_action, predicted_noise, noise, noise_level, clip=self.clip_denoised
+        return self.chain_schedule.denoise_step(
+            action, predicted_noise, noise, step, clip=self.clip_denoised
+        )
+
+    def _last_step(self, features: Any, action: Tensor, noise: Tensor, step: Tensor) -> Tensor:
+        """The step from level 1: sigma is 0 there, so the critic need not be asked."""
+        return self.chain_schedule.denoise_step(
+            action, torch.zeros_like(action), noise, step, clip=self.clip_denoised
         )
 
     def _gradient(self, features: Any, action: Tensor, index: Tensor) -> Tensor:
         gradient = self.critic.action_gradient(features, action, index)
         return F.normalize_gradient(gradient) if self.normalize_gradient else gradient
 
-    def _step(self, features: Any, action: Tensor, noise: Tensor, noise_level: Tensor) -> Tensor:
+    def _step(self, features: Any, action: Tensor, noise: Tensor, step: Tensor) -> Tensor:
         """The sampler's step, compiled on first use where the actor was built so."""
         if not self.compile_step or torch.compiler.is_compiling():
-            return self._chain_step(features, action, noise, noise_level)
+            return self._chain_step(features, action, noise, step)
         if "_compiled_step" not in self.__dict__:
             self.__dict__["_compiled_step"] = torch.compile(self._chain_step, dynamic=True)
         # Dynamic, and on copies: acting, targets and evaluation differ in rows, and code compiled
         # for a view depends on the tensor behind it. Each would be compiled anew.
-        inputs = (tensor.clone() for tensor in (action, noise, noise_level))
+        inputs = (tensor.clone() for tensor in (action, noise, step))
         return self.__dict__["_compiled_step"](features, *inputs)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -324,10 +337,9 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         return self.to_env(action).reshape(*batch, self.action_dim)
 
     def _draws(self, num_chains: int, num_rows: int, deterministic: bool) -> Tensor:
-        """All draws of a call, ``(T + 2, N, rows, A)``: chain noise, then exploration noise."""
-        num_steps = self.schedule.num_steps
+        """All draws of a call, ``(S + 2, N, rows, A)``: chain noise, then exploration noise."""
         if not deterministic:
-            shape = (num_steps + 2, num_chains, num_rows, self.action_dim)
+            shape = (self.num_inference_steps + 2, num_chains, num_rows, self.action_dim)
             return torch.randn(shape, dtype=self.center.dtype, device=self.center.device)
         if num_chains > self.fixed_noise.shape[1]:
             raise ValueError(

@@ -202,7 +202,7 @@ class ACALoss(LossModule):
         clean_value, value = self._values(
             observation, (action, self._clean_level(action)), (noisy_action, level)
         )
-        target = F.noise_level_target(clean_value.detach(), self.noise_level_target)
+        target = F.noise_level_target(clean_value, self.noise_level_target)
         error = distance_loss(value, target, self.loss_function).sum(-1)
         metrics = {"noisy_value": value.detach().mean()}
         return self._output("loss_noise_level", error, tensordict, metrics)
@@ -249,17 +249,33 @@ class ACALoss(LossModule):
         """Critic values of shape ``(*batch, E)``, one for each (action, level) in ``queries``.
 
         The states are encoded once for all queries, under ``params`` (default: the online ones).
+        Only the last query is differentiated: what comes before it are targets.
         """
         critic, batch = self.qvalue_network, queries[0][0].shape[:-1]
         rows = [o.reshape(-1, *o.shape[len(batch) :]) for o in observation]
         params = self.qvalue_network_params if params is None else params
+        values = []
         with params.to_module(critic, preserve_module_state=False):
             features = critic.encode(*rows)
-            values = [
-                critic.evaluate(features, action.reshape(-1, action.shape[-1]), level.reshape(-1))
-                for action, level in queries
-            ]
-        return [value.reshape(*batch, value.shape[-1]) for value in values]
+            for number, (action, level) in enumerate(queries, start=1):
+                with torch.set_grad_enabled(torch.is_grad_enabled() and number == len(queries)):
+                    flat = action.reshape(-1, action.shape[-1])
+                    value = critic.evaluate(features, flat, level.reshape(-1))
+                values.append(value.reshape(*batch, value.shape[-1]))
+        return values
+
+    @torch.no_grad()
+    def sample_next_action(self, tensordict: TensorDictBase) -> Tensor:
+        """Draws ``a'_0`` of the target, in env units, shape ``(*batch, A)``.
+
+        :meth:`qvalue_loss` does so by itself where the input has no ``next_action``. Drawn
+        beforehand, it lets the rest of the loss be compiled without the chain.
+        """
+        observation = [tensordict[_next(key)] for key in self.actor_network.in_keys]
+        batch = tensordict[self.tensor_keys.action].shape[:-1]
+        return self.actor_network.sample(
+            observation, batch, num_candidates=self.num_target_candidates
+        )
 
     @torch.no_grad()
     def _target_value(self, tensordict: TensorDictBase) -> Tensor:
@@ -268,10 +284,7 @@ class ACALoss(LossModule):
         observation = [tensordict[_next(key)] for key in actor.in_keys]
         next_action = tensordict.get(keys.next_action, None)
         if next_action is None:
-            batch = tensordict[keys.action].shape[:-1]
-            next_action = actor.sample(
-                observation, batch, num_candidates=self.num_target_candidates
-            )
+            next_action = self.sample_next_action(tensordict)
         next_action = actor.from_env(next_action)
         (next_values,) = self._values(
             observation,

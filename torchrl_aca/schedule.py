@@ -15,14 +15,18 @@ __all__ = ["NoiseSchedule"]
 class NoiseSchedule(nn.Module):
     """Constants of a discrete diffusion process with ``T`` noise levels.
 
-    Every attribute listed below is a float64 buffer of shape ``(T,)``; row ``k - 1`` belongs to
-    noise level ``k`` (level 0 is the clean action and has no row). The constants follow device
-    moves but keep float64 when the module is cast, and are not part of the ``state_dict``.
+    Every attribute listed below is a buffer of shape ``(T,)``, float64 but for the levels; row
+    ``k - 1`` belongs to noise level ``k`` (level 0 is the clean action and has no row). The
+    constants follow device moves but keep float64 when the module is cast, and are not part of the
+    ``state_dict``.
 
     Args:
         betas: variances ``beta_1..beta_T`` of the forward process, each in (0, 1).
+        noise_levels: the level that each row belongs to, where they are not ``1..T``; what
+            :meth:`strided` gives.
 
     Attributes:
+        noise_levels: integers, ``1..T`` unless the schedule is a strided one.
         betas: ``beta_t``.
         alphas: ``1 - beta_t``.
         alphas_cumprod: ``alpha_bar_t``, the product of the alphas up to ``t``.
@@ -42,6 +46,7 @@ class NoiseSchedule(nn.Module):
         >>> noisy = schedule.add_noise(torch.zeros(5, 3), torch.randn(5, 3), torch.tensor(20))
     """
 
+    noise_levels: Tensor
     betas: Tensor
     alphas: Tensor
     alphas_cumprod: Tensor
@@ -50,7 +55,7 @@ class NoiseSchedule(nn.Module):
     posterior_mean_coef1: Tensor
     posterior_mean_coef2: Tensor
 
-    def __init__(self, betas: Tensor) -> None:
+    def __init__(self, betas: Tensor, noise_levels: Tensor | None = None) -> None:
         super().__init__()
         betas = torch.as_tensor(betas, dtype=torch.float64)
         if betas.ndim != 1 or not len(betas) or not bool(((betas > 0) & (betas < 1)).all()):
@@ -61,7 +66,10 @@ class NoiseSchedule(nn.Module):
         alphas = 1 - betas
         cumprod = alphas.cumprod(0)
         previous = torch.cat([torch.ones_like(cumprod[:1]), cumprod[:-1]])
+        if noise_levels is None:
+            noise_levels = torch.arange(1, len(betas) + 1, device=betas.device)
         constants = {
+            "noise_levels": noise_levels,
             "betas": betas,
             "alphas": alphas,
             "alphas_cumprod": cumprod,
@@ -94,6 +102,31 @@ class NoiseSchedule(nn.Module):
     def num_steps(self) -> int:
         """Number ``T`` of noise levels."""
         return len(self.betas)
+
+    def strided(self, num_steps: int) -> NoiseSchedule:
+        """The schedule of a chain that visits only ``num_steps`` of the levels.
+
+        The levels lie evenly from 1 to ``T``, both included, and keep their ``alpha_bar``, so
+        ``beta_i = 1 - alpha_bar(t_i) / alpha_bar(t_{i-1})``. A reverse chain on it takes the steps
+        of DDIM with ``eta = 1`` (Song et al. 2021, eq. 12 and 16); with all ``T`` it is the chain
+        itself.
+
+        Args:
+            num_steps: number of levels, from 2 to ``T``.
+
+        Raises:
+            ValueError: if it is not one of those.
+        """
+        if num_steps == self.num_steps:
+            return self
+        if not isinstance(num_steps, int) or not 2 <= num_steps < self.num_steps:
+            raise ValueError(
+                f"Expected a number of steps from 2 to {self.num_steps}, got {num_steps!r}."
+            )
+        rows = torch.linspace(0, self.num_steps - 1, num_steps).round().long()
+        cumprod = self.alphas_cumprod[rows.to(self.alphas_cumprod.device)]
+        previous = torch.cat([torch.ones_like(cumprod[:1]), cumprod[:-1]])
+        return NoiseSchedule(1 - cumprod / previous, self.noise_levels[rows.to(cumprod.device)])
 
     def add_noise(self, action: Tensor, noise: Tensor, noise_level: Tensor) -> Tensor:
         """Noise ``action`` to ``noise_level``.

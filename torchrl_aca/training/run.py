@@ -111,7 +111,7 @@ class Run:
         self.bar.show_evaluation(self.counters.updates, self.counters.frames, values)
 
     def has_reached(self, stop_return: float | None) -> bool:
-        """Whether the latest two evaluations average at least `stop_return`; never if it is None."""
+        """Whether the latest two evaluations average `stop_return`; never where it is None."""
         latest = [float(row["return_mean"]) for row in self.logger.tables["eval"].rows[-2:]]
         return stop_return is not None and len(latest) == 2 and sum(latest) / 2 >= stop_return
 

@@ -1,0 +1,134 @@
+"""ACA for the recipes: `make_aca(cfg, env, device) -> Agent`."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import torch
+from omegaconf import DictConfig
+from tensordict import TensorDictBase
+from torchrl.envs import EnvBase
+from torchrl.objectives import SoftUpdate
+
+from torchrl_aca import ACALoss, CriticGuidedDenoisingActor, NoiseLevelCritic, NoiseSchedule
+from torchrl_aca.training.acceleration import capture, compiled, make_adam
+from torchrl_aca.training.agent import Agent
+from torchrl_aca.training.checkpoint import Counters
+
+SCHEDULES = {
+    "cosine": NoiseSchedule.cosine,
+    "linear": NoiseSchedule.linear,
+    "vp": NoiseSchedule.vp,
+}
+
+
+def make_aca_loss(cfg: DictConfig, env: EnvBase, device: torch.device) -> ACALoss:
+    """The critic, the actor that it guides, and their loss."""
+    settings = cfg.aca
+    schedule = SCHEDULES.get(settings.schedule)
+    if schedule is None:
+        raise ValueError(f"aca.schedule={settings.schedule}: expected one of {list(SCHEDULES)}.")
+    action_spec = env.action_spec_unbatched
+    critic = NoiseLevelCritic(
+        env.observation_spec["observation"].shape[-1],
+        action_spec.shape[-1],
+        num_steps=settings.num_steps,
+        num_critics=settings.num_critics,
+        num_cells=list(settings.num_cells),
+        first_level=settings.first_level,
+        device=device,
+    )
+    actor = CriticGuidedDenoisingActor(
+        critic,
+        schedule(settings.num_steps),
+        spec=action_spec,
+        guidance_weight=settings.guidance_weight,
+        num_candidates=settings.num_candidates,
+        num_inference_steps=settings.num_inference_steps,
+        exploration_noise=settings.exploration_noise,
+        alpha_init=settings.alpha_init,
+        compile_step=cfg.compile,
+    ).to(device)
+    loss = ACALoss(
+        actor,
+        num_target_candidates=settings.num_target_candidates,
+        noise_level_target=settings.noise_level_target,
+        target_entropy_scale=settings.target_entropy_scale,
+        reward_scale=settings.reward_scale,
+    )
+    loss.make_value_estimator(gamma=cfg.optim.gamma)
+    return loss
+
+
+def make_aca(cfg: DictConfig, env: EnvBase, device: torch.device) -> Agent:
+    """ACA, in the official code's order: a TD step, then at even updates a noise-level step.
+
+    The four steps are functions of a batch alone, so that each can be captured as a CUDA graph;
+    what changes from update to update, which of them to take and the learning rate, stays outside.
+    """
+    settings, optim = cfg.aca, cfg.optim
+    loss = make_aca_loss(cfg, env, device)
+    target_update = SoftUpdate(loss, tau=optim.tau)
+    optimizer = make_adam(loss.qvalue_network.parameters(), optim.lr, cfg)
+    alpha_optimizer = make_adam([loss.log_alpha], optim.alpha_lr, cfg)
+    # The decay counts steps of the optimiser, of which an update takes one or two.
+    scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, partial(lr_factor, optim))
+    progress = Counters()
+    # The chain compiles its own step, so it is drawn before the compiled loss.
+    qvalue_loss = compiled(loss.qvalue_loss, cfg)
+    noise_level_loss = compiled(loss.noise_level_loss, cfg)
+
+    def descend(losses: TensorDictBase, name: str, optimizer: torch.optim.Adam) -> TensorDictBase:
+        losses[name].backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        return losses.detach()
+
+    @partial(capture, cfg=cfg)
+    def td_step(batch: TensorDictBase) -> TensorDictBase:
+        batch = batch.copy()
+        batch[loss.tensor_keys.next_action] = loss.sample_next_action(batch)
+        return descend(qvalue_loss(batch), "loss_qvalue", optimizer)
+
+    @partial(capture, cfg=cfg)
+    def noise_level_step(batch: TensorDictBase) -> TensorDictBase:
+        return descend(noise_level_loss(batch), "loss_noise_level", optimizer)
+
+    @partial(capture, cfg=cfg)
+    def alpha_step(batch: TensorDictBase) -> TensorDictBase:
+        return descend(loss.alpha_loss(), "loss_alpha", alpha_optimizer)
+
+    @partial(capture, cfg=cfg)
+    def target_step(batch: TensorDictBase) -> None:
+        target_update.step()
+
+    def update(batch: TensorDictBase) -> TensorDictBase:
+        metrics = td_step(batch)
+        scheduler.step()
+        if progress.updates % settings.noise_level_interval == 0:
+            metrics.update(noise_level_step(batch))
+            scheduler.step()
+        target_step(batch)
+        if progress.updates % settings.alpha_interval == 0:
+            metrics.update(alpha_step(batch))
+        progress.updates += 1
+        return metrics
+
+    return Agent(
+        loss.actor_network,
+        update,
+        state={
+            "loss": loss,
+            "optimizer": optimizer,
+            "alpha_optimizer": alpha_optimizer,
+            "scheduler": scheduler,
+            "progress": progress,
+        },
+    )
+
+
+def lr_factor(optim: DictConfig, step: int) -> float:
+    """Returns the factor of `lr` after so many optimiser steps: linear decay to `lr_end`."""
+    span = max(optim.lr_decay_end - optim.lr_decay_start, 1)
+    progress = min(max((step - optim.lr_decay_start) / span, 0.0), 1.0)
+    return 1 + progress * (optim.lr_end / optim.lr - 1)

@@ -1,0 +1,83 @@
+"""SAC for the recipes, through TorchRL's loss: `make_sac(cfg, env, device) -> Agent`."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import torch
+from omegaconf import DictConfig
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.envs import EnvBase
+from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.objectives import SACLoss, SoftUpdate
+
+from torchrl_aca.training.acceleration import capture, compiled, make_adam
+from torchrl_aca.training.agent import Agent
+
+
+class BoundedNormalParams(nn.Module):
+    """Splits (..., 2A) into a mean and a standard deviation whose logarithm is clamped."""
+
+    def __init__(self, log_std_min: float, log_std_max: float) -> None:
+        """Takes the bounds of the logarithm."""
+        super().__init__()
+        self.bounds = (log_std_min, log_std_max)
+
+    def forward(self, params: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns mean and standard deviation, (..., A) each."""
+        mean, log_std = params.chunk(2, dim=-1)
+        return mean, log_std.clamp(*self.bounds).exp()
+
+
+def make_sac(cfg: DictConfig, env: EnvBase, device: torch.device) -> Agent:
+    """SAC with a tanh-squashed Gaussian, two critics and a learned temperature."""
+    settings = cfg.sac
+    action_spec = env.action_spec_unbatched
+    observation_dim = env.observation_spec["observation"].shape[-1]
+    action_dim = action_spec.shape[-1]
+    activation = getattr(nn, settings.activation, None)
+    if activation is None:
+        raise ValueError(f"sac.activation={settings.activation}: expected a class of torch.nn.")
+    mlp = {"num_cells": list(settings.num_cells), "activation_class": activation, "device": device}
+    actor_network = nn.Sequential(
+        MLP(in_features=observation_dim, out_features=2 * action_dim, **mlp),
+        BoundedNormalParams(settings.log_std_min, settings.log_std_max),
+    )
+    policy = ProbabilisticActor(
+        TensorDictModule(actor_network, in_keys=["observation"], out_keys=["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        spec=action_spec.to(device),
+        distribution_class=TanhNormal,
+        distribution_kwargs={
+            "low": action_spec.space.low.to(device),
+            "high": action_spec.space.high.to(device),
+        },
+    )
+    critic = ValueOperator(
+        MLP(in_features=observation_dim + action_dim, out_features=1, **mlp),
+        in_keys=["observation", "action"],
+    )
+    loss = SACLoss(
+        policy, critic, num_qvalue_nets=2, loss_function="l2", alpha_init=settings.alpha_init
+    ).to(device)
+    loss.make_value_estimator(gamma=cfg.optim.gamma)
+    target_update = SoftUpdate(loss, tau=cfg.optim.tau)
+    optimizer = make_adam(loss.parameters(), cfg.optim.lr, cfg)
+    evaluate_loss = compiled(loss, cfg)
+
+    @partial(capture, cfg=cfg)
+    def update(batch: TensorDictBase) -> TensorDictBase:
+        batch = batch.copy()
+        batch["next", "reward"] = settings.reward_scale * batch["next", "reward"]
+        losses = evaluate_loss(batch)
+        # The actor's loss sees the critics' values but not their parameters, so one backward pass
+        # through the sum gives each part its own gradient.
+        (losses["loss_actor"] + losses["loss_qvalue"] + losses["loss_alpha"]).backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        target_update.step()
+        return losses.detach()
+
+    return Agent(policy, update, state={"loss": loss, "optimizer": optimizer})
