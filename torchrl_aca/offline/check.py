@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
 from torchrl_aca.offline.errors import DatasetError
@@ -60,8 +59,8 @@ class DatasetChecks:
         self.low: dict[str, torch.Tensor] = {}
         self.high: dict[str, torch.Tensor] = {}
 
-    def add(self, rows: TensorDictBase) -> None:
-        """Checks one episode of shape (L,) with the keys of the canonical form.
+    def add(self, rows: Mapping[NestedKey, torch.Tensor]) -> None:
+        """Checks one episode, given as L rows for each key of the canonical form.
 
         Raises:
             DatasetError: If a number is not finite, an action is out of bounds, or the episode
@@ -77,7 +76,7 @@ class DatasetChecks:
             self.low[name] = torch.minimum(self.low.get(name, low), low)
             self.high[name] = torch.maximum(self.high.get(name, high), high)
         self.episodes += 1
-        self.rows += len(rows)
+        self.rows += len(rows["action"])
 
     def finish(self) -> dict[str, Any]:
         """Checks what only all episodes together can tell.
@@ -102,7 +101,7 @@ class DatasetChecks:
             )
         return {"constant_columns": constant, "jumps": self.jumps}
 
-    def _check_finite(self, rows: TensorDictBase, where: str) -> None:
+    def _check_finite(self, rows: Mapping[NestedKey, torch.Tensor], where: str) -> None:
         for key in NUMBERS:
             bad = (~rows[key].isfinite()).nonzero()
             if len(bad):

@@ -136,6 +136,8 @@ class DatasetWriter:
             ("next", "terminated"): terminated,
             ("next", "truncated"): truncated,
         }
+        if not self._files:
+            raise DatasetError("open the writer first: `with DatasetWriter(...) as writer:`.")
         rows = self._rows(given)
         self.checks.add(rows)
         for key, file in self._files.items():
@@ -143,7 +145,7 @@ class DatasetWriter:
         if not complete:
             self.cut.append(len(self.returns))
         self.returns.append(rows["next", "reward"].double().sum().item())
-        self.lengths.append(len(rows))
+        self.lengths.append(len(rows["episode"]))
 
     def finish(
         self,
@@ -159,7 +161,8 @@ class DatasetWriter:
             name: What the data set is called in tables and figures.
             env_id: Gymnasium id of the environment, if there is one.
             reference_scores: Returns that count as 0 and as 100 in normalised scores.
-            provenance: Where the data come from: command, versions, seeds, ... as JSON allows it.
+            provenance: Where the data come from: command, versions, seeds, and so on. What JSON
+                does not know is stored as text.
 
         Returns:
             The data set, loaded from its path.
@@ -189,17 +192,17 @@ class DatasetWriter:
                 file_name(key): sha256(self.staging / file_name(key)) for key in self.layout
             },
         }
-        text = json.dumps(metadata, indent=2, allow_nan=False)
+        text = json.dumps(metadata, indent=2, default=str)
         (self.staging / METADATA_FILE).write_text(text + "\n")
         OfflineDataset.load(self.staging)
         os.rename(self.staging, self.path)
         return OfflineDataset.load(self.path)
 
-    def _rows(self, given: Mapping[NestedKey, Any]) -> TensorDict:
-        """Returns one episode in canonical form, shape (L,)."""
+    def _rows(self, given: Mapping[NestedKey, Any]) -> dict[NestedKey, torch.Tensor]:
+        """Returns one episode in canonical form: for each key L rows."""
         episode = len(self.lengths)
         length = len(given["observation"])
-        rows = TensorDict(batch_size=[length])
+        rows = {}  # a TensorDict would double the time of short episodes
         for key, value in given.items():
             shape, dtype = self.layout[key]
             expected = (length, *shape) if key in VECTORS else (length,)
@@ -214,6 +217,7 @@ class DatasetWriter:
         for file in self._files.values():
             file.flush()
             os.fsync(file.fileno())
+        self._open.close()
         size = sum(self.lengths)
         mapped = {
             key: MemoryMappedTensor.from_filename(
