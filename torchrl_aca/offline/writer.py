@@ -170,7 +170,7 @@ class DatasetWriter:
         Raises:
             DatasetError: If the data fail a check; nothing is at the path then.
         """
-        checked = self.checks.finish()
+        scores, checked = _reference_scores(reference_scores), self.checks.finish()
         self._sync()
         low, high = (bound.tolist() for bound in self.bounds)
         metadata = {
@@ -184,7 +184,7 @@ class DatasetWriter:
             "incomplete_episodes": self.cut,
             "returns": self._statistics(self.returns),
             "lengths": self._statistics(self.lengths),
-            "reference_scores": _reference_scores(reference_scores),
+            "reference_scores": scores,
             "action_bounds": {"low": low, "high": high},
             **checked,
             "provenance": dict(provenance or {}),
