@@ -63,6 +63,7 @@ try:
     import gymnasium
 except ModuleNotFoundError:
     import {PACKAGE}
+    import {PACKAGE}.offline
     assert {PACKAGE}.__all__
 else:
     sys.exit("the extras were not hidden")
@@ -110,6 +111,13 @@ def test_training_knows_no_algorithm() -> None:
     assert files
     for path in files:
         assert imported_parts(path) <= {"training"}, path.name
+
+
+def test_offline_knows_no_algorithm() -> None:
+    files = sorted((ROOT / PACKAGE / "offline").rglob("*.py"))
+    assert files
+    for path in files:
+        assert imported_parts(path) <= {"offline", "training", "checks"}, path.name
 
 
 def test_package_never_imports_recipes() -> None:
