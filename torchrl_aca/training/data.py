@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from tensordict.utils import NestedKey
+from torchrl.data import LazyTensorStorage, ReplayBuffer, TensorDictReplayBuffer
 
 from torchrl_aca.training.errors import RunError
 
@@ -34,24 +36,30 @@ def transitions(data: TensorDictBase) -> TensorDictBase:
 class BufferState:
     """The filled part of a replay buffer, for checkpoints."""
 
-    def __init__(self, buffer: TensorDictReplayBuffer) -> None:
-        """Takes the buffer; it is only read when a state is asked for."""
-        self.buffer = buffer
+    def __init__(self, buffer: ReplayBuffer, keys: Sequence[NestedKey] = TRANSITION_KEYS) -> None:
+        """Takes the buffer, which is only read when a state is asked for, and the keys to keep."""
+        self.buffer, self.keys = buffer, keys
 
     def state_dict(self) -> dict[str, Any]:
         """Returns the rows in storage order and the writer's position."""
+        return {"rows": self._rows(), "writer": self.buffer.writer.state_dict()}
+
+    def _rows(self) -> dict[str, torch.Tensor]:
         size = len(self.buffer)
-        rows = self.buffer[:size].select(*TRANSITION_KEYS, strict=False).flatten_keys(".")
+        if size == 0:  # a storage that is allocated lazily cannot be read yet
+            return {}
+        rows = self.buffer[:size].select(*self.keys, strict=False).flatten_keys(".")
         if size < self.buffer.storage.max_size:
             # A view would be written with the whole, mostly empty storage behind it.
             rows = rows.clone()
-        return {"rows": rows.to_dict(), "writer": self.buffer.writer.state_dict()}
+        return rows.to_dict()
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Replaces the buffer's content."""
-        rows = TensorDict(state_dict["rows"]).auto_batch_size_(1).unflatten_keys(".")
         self.buffer.empty()
-        self.buffer.extend(rows)
+        if state_dict["rows"]:
+            rows = TensorDict(state_dict["rows"]).auto_batch_size_(1).unflatten_keys(".")
+            self.buffer.extend(rows)
         self.buffer.writer.load_state_dict(state_dict["writer"])
 
 
