@@ -6,6 +6,7 @@ from torchrl_aca.offline.from_d4rl import import_d4rl
 from torchrl_aca.offline.from_minari import import_minari
 from torchrl_aca.offline.mixture import MixedReplayBuffer
 from torchrl_aca.offline.registry import register_datasets
+from torchrl_aca.offline.scores import reference_scores
 from torchrl_aca.offline.writer import DatasetWriter
 
 __all__ = [
@@ -15,6 +16,7 @@ __all__ = [
     "OfflineDataset",
     "import_d4rl",
     "import_minari",
+    "reference_scores",
     "register_datasets",
     "returns_to_go",
 ]

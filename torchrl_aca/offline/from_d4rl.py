@@ -11,10 +11,9 @@ import torch
 from torchrl_aca.offline.dataset import OfflineDataset
 from torchrl_aca.offline.errors import DatasetError
 from torchrl_aca.offline.importing import provenance_of, reading, write_episodes
+from torchrl_aca.offline.scores import reference_scores as known_scores
 from torchrl_aca.offline.writer import DatasetWriter
 
-# Returns of a random and of an expert policy as D4RL gives them, the same for all its versions.
-REFERENCE_SCORES = {"HalfCheetah": (-280.178953, 12135.0)}
 RANKS = {"observations": 2, "actions": 2, "rewards": 1, "terminals": 1, "timeouts": 1}
 BLOCK = 50_000  # rows read at a time; more only where an episode is longer
 
@@ -77,16 +76,12 @@ def import_d4rl(
             return writer.finish(
                 name=name or source.stem,
                 env_id=env_id,
-                reference_scores=reference_scores or _scores(env_id),
+                reference_scores=reference_scores or known_scores(env_id),
                 provenance={
                     **provenance_of("import_d4rl", source.name, source, "h5py"),
                     "dropped_rows": size - sum(writer.lengths),
                 },
             )
-
-
-def _scores(env_id: str | None) -> tuple[float, float] | None:
-    return REFERENCE_SCORES.get((env_id or "").rpartition("-v")[0])
 
 
 def _columns(file: Any, source: Path) -> dict[str, Any]:

@@ -100,3 +100,16 @@ def plot_curve(run_dir: Path, title: str, evaluations: Sequence[Mapping[str, Any
     axes.set(title=title, xlabel=f"updates ({frames[-1]:.0f} frames at the end)", ylabel="return")
     axes.grid(alpha=0.3)
     figure.savefig(run_dir / "curve.png", dpi=120)
+
+
+def plot_returns(path: Path, returns: torch.Tensor, title: str) -> None:
+    """Draws the distribution of the returns of a data set's episodes, shape (episodes,)."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6, 4), layout="constrained")
+    axes = figure.subplots()
+    axes.hist(returns.tolist(), bins=50)
+    axes.axvline(returns.mean().item(), color="black", linestyle="--", label="mean")
+    axes.set(title=title, xlabel="return of an episode", ylabel="episodes")
+    axes.legend()
+    figure.savefig(path, dpi=120)
