@@ -63,9 +63,15 @@ def train(cfg: DictConfig, checkpoint: dict[str, Any] | None = None) -> Path:
     if checkpoint:  # once more, because building the collector draws random numbers
         restore({"random": parts["random"]}, checkpoint["parts"])
 
+    def metrics() -> dict[str, float]:
+        return {**episodes.metrics(), **means.pop()}
+
+    def evaluation() -> dict[str, float]:
+        return evaluate(agent.policy, eval_env, cfg.eval.seed, device)
+
     with Run(cfg, parts, counters, resumed=checkpoint is not None) as run:
         if counters.frames == 0:
-            run.log_evaluation(evaluate(agent.policy, eval_env, cfg.eval.seed, device))
+            run.log_evaluation(evaluation())
         for data in collector:  # data has the shape (num_envs, steps)
             run.check(data)
             counters.frames += data.numel()
@@ -78,15 +84,7 @@ def train(cfg: DictConfig, checkpoint: dict[str, Any] | None = None) -> Path:
                 counters.updates += 1
             collector.update_policy_weights_()
 
-            last = counters.updates >= cfg.optim.total_updates
-            if counters.passed(cfg.logger.interval, since=start):
-                run.log_metrics({**episodes.metrics(), **means.pop()})
-            if counters.passed(cfg.eval.interval, since=start) or last:
-                run.log_evaluation(evaluate(agent.policy, eval_env, cfg.eval.seed, device))
-                last = last or run.has_reached(cfg.eval.stop_return)
-            if counters.passed(cfg.checkpoint.interval, since=start):
-                run.save()
-            run.show_progress()
+            last = run.end_iteration(start, metrics, evaluation)
             if last or run.stopping:
                 break
         run.finish(completed=last)

@@ -6,7 +6,7 @@ import json
 from dataclasses import dataclass
 from math import prod
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -21,8 +21,7 @@ from torchrl_aca.offline.layout import (
     row_layout,
     sha256,
 )
-
-Number = TypeVar("Number", float, torch.Tensor)
+from torchrl_aca.offline.scores import Number, normalized_score
 
 
 @dataclass(frozen=True)
@@ -116,7 +115,7 @@ class OfflineDataset:
                 f"{self.metadata['name']!r} has no reference scores, so no return can be "
                 "normalised. Give reference_scores=(min, max) when the data set is written."
             )
-        return 100 * (episode_return - scores["min"]) / (scores["max"] - scores["min"])
+        return normalized_score(episode_return, (scores["min"], scores["max"]))
 
 
 def returns_to_go(data: TensorDictBase, gamma: float) -> torch.Tensor:

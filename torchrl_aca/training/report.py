@@ -58,8 +58,9 @@ def write_card(
     config: Mapping[str, Any],
     evaluations: Sequence[Mapping[str, Any]],
     seconds: float,
+    facts: Mapping[str, object],
 ) -> None:
-    """Writes card.md: what was run, on what, and what came out."""
+    """Writes card.md: what was run, on what, what came out, and whatever `facts` adds."""
     last = evaluations[-1]
     info = json.loads((run_dir / "versions.json").read_text())
     rows = {
@@ -70,6 +71,7 @@ def write_card(
         "environment frames": f"{last['frames']} (warm-up included)",
         "final return": f"{float(last['return_mean']):.1f} ± {float(last['return_std']):.1f} "
         f"(mean ± std of {float(last['num_episodes']):.0f} episodes)",
+        **facts,
         "wall-clock time": f"{seconds / 60:.1f} min",
         **{name: value for name, value in info.items() if value is not None},
     }

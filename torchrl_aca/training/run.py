@@ -6,7 +6,7 @@ import json
 import signal
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import FrameType
 
@@ -19,6 +19,8 @@ from torchrl_aca.training.data import check_finite
 from torchrl_aca.training.errors import RunError
 from torchrl_aca.training.logging import ProgressBar, RunLogger
 from torchrl_aca.training.report import plot_curve, versions, write_card
+
+Metrics = Mapping[str, float]
 
 
 def make_run_dir(cfg: DictConfig) -> Path:
@@ -50,7 +52,12 @@ class Run:
     """
 
     def __init__(
-        self, cfg: DictConfig, parts: Mapping[str, Stateful], counters: Counters, resumed: bool
+        self,
+        cfg: DictConfig,
+        parts: Mapping[str, Stateful],
+        counters: Counters,
+        resumed: bool,
+        facts: Mapping[str, object] | None = None,
     ) -> None:
         """Opens a new run directory, or the one in `cfg.resume`.
 
@@ -59,12 +66,13 @@ class Run:
             parts: Everything that a checkpoint holds.
             counters: One of the parts.
             resumed: Whether the parts come from a checkpoint.
+            facts: More rows for the card.
         """
         self.dir = Path(cfg.resume) if resumed else make_run_dir(cfg)
         # The run as it is now: a resume may have changed the number of updates or the logger.
         self.config = {**OmegaConf.to_container(cfg, resolve=True), "resume": None}
         (self.dir / "config.yaml").write_text(OmegaConf.to_yaml(self.config))
-        self.parts, self.counters = parts, counters
+        self.parts, self.counters, self.facts = parts, counters, facts or {}
         self._saved: int | None = None  # frames at the latest checkpoint of this sitting
         self.logger = RunLogger(self.dir, self.config, counters.updates if resumed else None)
         self.bar = ProgressBar(cfg.optim.total_updates, counters.updates)
@@ -99,25 +107,42 @@ class Run:
             path = self.save(without=("env", "episodes"))
             raise RunError(f"{error} What came before is in {path}.") from None
 
-    def log_metrics(self, values: Mapping[str, float]) -> None:
+    def log_metrics(self, values: Metrics) -> None:
         """Adds a row of training metrics, with the time and the speed."""
         values = {**values, **self._speed()}
         self.logger.log("metrics", self.counters.updates, self.counters.frames, values)
         self.bar.show_metrics(self.counters.updates, self.counters.frames, values)
 
-    def log_evaluation(self, values: Mapping[str, float]) -> None:
+    def log_evaluation(self, values: Metrics) -> None:
         """Adds a row of evaluation results."""
         self.logger.log("eval", self.counters.updates, self.counters.frames, values)
         self.bar.show_evaluation(self.counters.updates, self.counters.frames, values)
 
-    def has_reached(self, stop_return: float | None) -> bool:
-        """Whether the latest two evaluations average `stop_return`; never where it is None."""
+    def end_iteration(
+        self, since: int, metrics: Callable[[], Metrics], evaluation: Callable[[], Metrics]
+    ) -> bool:
+        """Logs, evaluates and saves what is due, and tells whether all updates are made.
+
+        Args:
+            since: Updates that had been made before this iteration.
+            metrics: Gives the training metrics; called when a row of them is due.
+            evaluation: Evaluates the policy; called when that is due.
+        """
+        cfg = self.config
+        last = self.counters.updates >= cfg["optim"]["total_updates"]
+        if self.counters.passed(cfg["logger"]["interval"], since):
+            self.log_metrics(metrics())
+        if self.counters.passed(cfg["eval"]["interval"], since) or last:
+            self.log_evaluation(evaluation())
+            last = last or self._has_reached(cfg["eval"]["stop_return"])
+        if self.counters.passed(cfg["checkpoint"]["interval"], since):
+            self.save()
+        self.bar.advance(self.counters.updates)
+        return last
+
+    def _has_reached(self, stop_return: float | None) -> bool:
         latest = [float(row["return_mean"]) for row in self.logger.tables["eval"].rows[-2:]]
         return stop_return is not None and len(latest) == 2 and sum(latest) / 2 >= stop_return
-
-    def show_progress(self) -> None:
-        """Moves the progress bar."""
-        self.bar.advance(self.counters.updates)
 
     def _speed(self) -> dict[str, float]:
         then, updates, frames = self._lap
@@ -149,7 +174,7 @@ class Run:
             self.save()
         rows = self.logger.tables["eval"].rows
         title = f"{self.config['algo']['name']} on {self.config['env']['name']}"
-        write_card(self.dir, self.config, rows, self.counters.seconds)
+        write_card(self.dir, self.config, rows, self.counters.seconds, self.facts)
         plot_curve(self.dir, title, rows)
         if completed:
             before, after = (float(row["return_mean"]) for row in (rows[0], rows[-1]))
