@@ -28,7 +28,7 @@ class DatasetWriter:
     """Writes episodes to a new data set in canonical form.
 
     Episodes go to `<path>.partial` as they come; `finish` checks the whole, writes the metadata and
-    renames the directory to `path`. Without `finish` nothing is left.
+    renames the directory to `path`. Without `finish` nothing is left::
 
         with DatasetWriter("datasets/mine", observation_dim=17, action_dim=6) as writer:
             for episode in episodes:

@@ -1,0 +1,350 @@
+"""Imports of D4RL's and Minari's data sets, from small files written in their own layout."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+from offline_cases import ACTION_DIM, OBSERVATION_DIM, episode, joined
+
+from torchrl_aca.offline import (
+    DatasetError,
+    DatasetWriter,
+    OfflineDataset,
+    from_d4rl,
+    import_d4rl,
+    import_minari,
+)
+
+h5py = pytest.importorskip("h5py")
+minari = pytest.importorskip("minari")
+spaces = pytest.importorskip("gymnasium").spaces
+
+RECIPES = Path(__file__).parents[1] / "recipes"
+# Ends by the time limit, by a terminal, by the time limit after one step, and by the file's end.
+EPISODES = [episode(4), episode(5, "terminated"), episode(1), episode(3, "none")]
+NAMES = {
+    "observations": "observation",
+    "actions": "action",
+    "next_observations": "next_observation",
+    "rewards": "reward",
+    "terminals": "terminated",
+    "timeouts": "truncated",
+}
+
+
+def write_d4rl(path: Path, episodes=EPISODES, *, without=(), **replaced) -> Path:
+    """A file in D4RL's layout, in float32 and compressed, with infos that nobody reads."""
+    arrays = {name: joined(episodes, key) for name, key in NAMES.items()} | replaced
+    with h5py.File(path, "w") as file:
+        for name, array in arrays.items():
+            if name not in without:
+                dtype = "f4" if np.asarray(array).dtype == np.float64 else None
+                file.create_dataset(name, data=array, dtype=dtype, compression="gzip")
+        file["infos/qpos"] = np.zeros((2, 9))
+        file["metadata/algorithm"] = "SAC"
+    return path
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    return write_d4rl(tmp_path / "halfcheetah_test-v2.hdf5")
+
+
+def assert_rows(dataset: OfflineDataset, expected: dict[str, np.ndarray]) -> None:
+    data = dataset.data
+    stored = {
+        "observation": data["observation"],
+        "action": data["action"],
+        "next_observation": data["next", "observation"],
+        "reward": data["next", "reward"].squeeze(-1),
+        "terminated": data["next", "terminated"].squeeze(-1),
+        "truncated": data["next", "truncated"].squeeze(-1),
+    }
+    for name, values in stored.items():
+        wanted = expected[name]
+        wanted = wanted.astype(np.float32) if wanted.dtype == np.float64 else wanted
+        np.testing.assert_array_equal(values, wanted, err_msg=name)
+    np.testing.assert_array_equal(data["episode"], expected["episode"])
+
+
+# --- D4RL -----------------------------------------------------------------------------------------
+
+
+def test_d4rl_with_next_observations_keeps_every_row(source, tmp_path):
+    dataset = import_d4rl(source, tmp_path / "data", env_id="HalfCheetah-v2", progress=False)
+    expected = {name: joined(EPISODES, name) for name in NAMES.values()}
+    expected["truncated"][-1] = True  # the recording ended here
+    expected["episode"] = np.repeat([0, 1, 2, 3], [4, 5, 1, 3])
+    assert_rows(dataset, expected)
+    assert dataset.metadata["incomplete_episodes"] == [3]
+    assert dataset.metadata["name"] == "halfcheetah_test-v2"
+    assert dataset.metadata["env_id"] == "HalfCheetah-v2"
+    provenance = dataset.metadata["provenance"]
+    assert provenance["source"] == source.name and provenance["dropped_rows"] == 0
+    assert len(provenance["source_sha256"]) == 64
+    assert dataset.normalized_score(12135.0) == 100
+    assert dataset.normalized_score(4770.3) == pytest.approx(40.68, abs=0.01)
+
+
+def test_d4rl_without_next_observations_drops_rows_whose_next_one_is_needed(tmp_path):
+    source = write_d4rl(tmp_path / "x.hdf5", without=["next_observations"])
+    dataset = import_d4rl(source, tmp_path / "data", progress=False)
+    # Of the first episode 3 of 4 rows are left, all 5 of the second, none of the third, 2 of 3 of
+    # the last. A terminal row's own observation stands in for the next one, which is not used.
+    first, second, _, last = EPISODES
+    kept = [{k: v[:3] for k, v in first.items()}, second, {k: v[:2] for k, v in last.items()}]
+    expected = {name: joined(kept, name).copy() for name in NAMES.values()}
+    expected["next_observation"][7] = second["observation"][-1]
+    expected["truncated"][:] = np.isin(np.arange(10), [2, 9])
+    expected["episode"] = np.repeat([0, 1, 2], [3, 5, 2])
+    assert_rows(dataset, expected)
+    assert dataset.metadata["incomplete_episodes"] == [2]
+    assert dataset.metadata["provenance"]["dropped_rows"] == 3
+
+
+@pytest.mark.parametrize("without", [[], ["next_observations"]])
+@pytest.mark.parametrize("block", [1, 6, 7])
+def test_the_size_of_a_block_does_not_matter(tmp_path, monkeypatch, without, block):
+    source = write_d4rl(tmp_path / "x.hdf5", without=without)
+    whole = import_d4rl(source, tmp_path / "whole", progress=False)
+    monkeypatch.setattr(from_d4rl, "BLOCK", block)
+    pieces = import_d4rl(source, tmp_path / "pieces", progress=False)
+    assert (whole.data == pieces.data).all() and len(whole.data) == len(pieces.data)
+
+
+def test_flags_may_be_numbers_as_some_files_have_them(source, tmp_path):
+    numbers = {
+        name: joined(EPISODES, NAMES[name]).astype("u1") for name in ("terminals", "timeouts")
+    }
+    other = write_d4rl(tmp_path / "numbers.hdf5", **numbers)
+    first = import_d4rl(source, tmp_path / "first", progress=False)
+    assert (import_d4rl(other, tmp_path / "other", progress=False).data == first.data).all()
+
+
+def test_other_reference_scores_and_other_bounds_can_be_given(source, tmp_path):
+    options = {"reference_scores": (0, 10), "action_bounds": (-2, 2), "progress": False}
+    dataset = import_d4rl(source, tmp_path / "data", env_id="HalfCheetah-v2", **options)
+    assert dataset.normalized_score(5) == 50
+    assert dataset.metadata["action_bounds"] == {"low": [-2, -2], "high": [2, 2]}
+    unknown = import_d4rl(source, tmp_path / "unknown", env_id="Mine-v0", progress=False)
+    assert unknown.metadata["reference_scores"] is None
+
+
+ROWS = len(joined(EPISODES, "reward"))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"without": ["timeouts", "actions"]}, r"has no \['actions', 'timeouts'\].*found"),
+        ({"rewards": np.zeros(ROWS - 1)}, "equal length"),
+        ({"next_observations": np.zeros((ROWS, 2))}, "equal shape"),
+        ({"rewards": np.zeros((ROWS, 1))}, r"'rewards' is .*expected .*\(rows,\)"),
+        ({"observations": np.zeros(ROWS)}, r"'observations' is .*expected .*\(rows, columns\)"),
+        ({"actions": np.full((ROWS, 2), b"left")}, "'actions' is .*array of numbers"),
+        ({"terminals": np.zeros(ROWS, bool), "timeouts": np.zeros(ROWS, bool)}, "none of its 13"),
+        ({"episodes": [{k: v[:0] for k, v in EPISODES[0].items()}]}, "is empty"),
+        ({"observations": np.zeros((ROWS, 3))}, "Nothing of observation varies"),
+        ({"observations": np.random.default_rng(9).normal(size=(ROWS, 3))}, "inside episodes"),
+        ({"rewards": np.full(ROWS, np.nan)}, "next.reward is nan"),
+        ({"actions": joined(EPISODES, "action") * 9}, r"expected a number in \[-1.0, 1.0\]"),
+    ],
+)
+def test_wrong_d4rl_files_are_refused_with_the_reason(tmp_path, changes, message):
+    source = write_d4rl(tmp_path / "x.hdf5", **changes)
+    with pytest.raises(DatasetError, match=message):
+        import_d4rl(source, tmp_path / "data", progress=False)
+    assert list(tmp_path.iterdir()) == [source]
+
+
+def test_files_that_are_not_hdf5_are_refused(tmp_path):
+    with pytest.raises(DatasetError, match="does not exist"):
+        import_d4rl(tmp_path / "x.hdf5", tmp_path / "data")
+    (tmp_path / "x.hdf5").write_text("observations")
+    with pytest.raises(DatasetError, match="is no HDF5 file"):
+        import_d4rl(tmp_path / "x.hdf5", tmp_path / "data")
+
+
+def test_a_file_that_was_cut_short_is_refused(source, tmp_path):
+    source.write_bytes(source.read_bytes()[:-500])
+    with pytest.raises(DatasetError, match="cannot be read to its end.*truncated"):
+        import_d4rl(source, tmp_path / "data", progress=False)
+    assert list(tmp_path.iterdir()) == [source]
+
+
+def test_damage_that_shows_up_in_the_middle_leaves_nothing(source, tmp_path, monkeypatch):
+    monkeypatch.setattr(from_d4rl, "BLOCK", 4)
+    size = len(joined(EPISODES, "reward"))
+    random = np.random.default_rng(0)
+    with h5py.File(source, "r+") as file:
+        del file["rewards"]
+        rewards = random.normal(size=size).astype("f4")
+        file.create_dataset("rewards", data=rewards, chunks=(5,), compression="gzip")
+        last = file["rewards"].id.get_chunk_info(2)
+    content = bytearray(source.read_bytes())
+    content[last.byte_offset : last.byte_offset + last.size] = bytes(last.size)
+    source.write_bytes(content)
+    with pytest.raises(DatasetError, match="cannot be read to its end"):
+        import_d4rl(source, tmp_path / "data", progress=False)
+    assert list(tmp_path.iterdir()) == [source]
+
+
+def test_an_interrupted_import_leaves_nothing_and_can_be_repeated(source, tmp_path, monkeypatch):
+    add = DatasetWriter.add_episode
+
+    def interrupt(writer, **episode):
+        if writer.lengths:
+            raise KeyboardInterrupt
+        add(writer, **episode)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(DatasetWriter, "add_episode", interrupt)
+        import_d4rl(source, tmp_path / "data", progress=False)
+    assert list(tmp_path.iterdir()) == [source]
+    assert len(import_d4rl(source, tmp_path / "data", progress=False).data) == ROWS
+
+
+def test_progress_goes_to_stderr_when_asked_for(source, tmp_path, capsys):
+    import_d4rl(source, tmp_path / "quiet", progress=False)
+    assert capsys.readouterr().err == ""
+    import_d4rl(source, tmp_path / "shown")
+    assert f"{ROWS}/{ROWS}" in capsys.readouterr().err
+
+
+# --- Minari ---------------------------------------------------------------------------------------
+
+
+def make_minari(folder: Path, monkeypatch, episodes=EPISODES[:3], **keywords) -> Path:
+    """A data set of the real package in `folder`, and its directory."""
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(folder))
+    buffers = [
+        minari.data_collector.EpisodeBuffer(
+            id=i,
+            observations=np.vstack([each["observation"], each["next_observation"][-1:]]),
+            actions=each["action"],
+            rewards=each["reward"],
+            terminations=each["terminated"],
+            truncations=each["truncated"],
+        )
+        for i, each in enumerate(episodes)
+    ]
+    box = {
+        "observation_space": spaces.Box(-np.inf, np.inf, (OBSERVATION_DIM,), np.float64),
+        "action_space": spaces.Box(-2, 3, (ACTION_DIM,), np.float64),
+    }
+    minari.create_dataset_from_buffers("toy/test-v0", buffers, **{**box, **keywords})
+    return folder / "toy" / "test-v0"
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")  # Minari's, about authors left out
+@pytest.mark.parametrize("by", ["id", "directory"])
+def test_minari_rows_bounds_and_scores_come_over(tmp_path, monkeypatch, by):
+    directory = make_minari(tmp_path / "minari", monkeypatch)
+    source = "toy/test-v0" if by == "id" else directory
+    dataset = import_minari(source, tmp_path / "data", progress=False)
+    expected = {name: joined(EPISODES[:3], name) for name in NAMES.values()}
+    expected["episode"] = np.repeat([0, 1, 2], [4, 5, 1])
+    assert_rows(dataset, expected)
+    metadata = dataset.metadata
+    assert metadata["name"] == "toy/test-v0" and metadata["incomplete_episodes"] == []
+    assert metadata["action_bounds"] == {"low": [-2, -2], "high": [3, 3]}
+    assert metadata["reference_scores"] is None and metadata["env_id"] is None
+    assert len(metadata["provenance"]["source_sha256"]) == 64
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_minari_tells_environment_and_scores_where_it_knows_them(tmp_path, monkeypatch):
+    pendulum = [{**e, "action": e["action"][:, :1]} for e in EPISODES[:2]]
+    scores = {"ref_min_score": -100.0, "ref_max_score": 0.0}
+    directory = make_minari(
+        tmp_path / "minari",
+        monkeypatch,
+        pendulum,
+        env="Pendulum-v1",
+        observation_space=None,
+        action_space=None,
+        **scores,
+    )
+    dataset = import_minari(directory, tmp_path / "data", progress=False)
+    assert dataset.metadata["env_id"] == "Pendulum-v1"
+    assert dataset.normalized_score(-25.0) == 75
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_minari_episode_without_end_is_truncated_and_incomplete(tmp_path, monkeypatch):
+    directory = make_minari(tmp_path / "minari", monkeypatch, EPISODES[:1] + EPISODES[3:])
+    dataset = import_minari(directory, tmp_path / "data", progress=False)
+    truncated = dataset.data["next", "truncated"].squeeze(-1)
+    assert truncated.nonzero().squeeze(-1).tolist() == [3, 6]
+    assert dataset.metadata["incomplete_episodes"] == [1]
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_minari_spaces_that_are_no_vectors_are_refused(tmp_path, monkeypatch):
+    discrete = {"action_space": spaces.Discrete(3)}
+    chosen = [{**EPISODES[0], "action": np.zeros(4, np.int64)}]
+    directory = make_minari(tmp_path / "minari", monkeypatch, chosen, **discrete)
+    with pytest.raises(DatasetError, match=r"action space is Discrete\(3\); expected a Box"):
+        import_minari(directory, tmp_path / "data", progress=False)
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_minari_data_that_are_damaged_or_not_there_are_refused(tmp_path, monkeypatch):
+    directory = make_minari(tmp_path / "minari", monkeypatch)
+    for missing in ("toy/other-v0", "no id", str(tmp_path / "minari")):
+        with pytest.raises(DatasetError, match="is no Minari data set on this machine"):
+            import_minari(missing, tmp_path / "data", progress=False)
+    file = directory / "data" / "main_data.hdf5"
+    with h5py.File(file, "r+") as content:
+        del content["episode_1"]
+    with pytest.raises(DatasetError, match="cannot be read to its end.*episode_1"):
+        import_minari(directory, tmp_path / "data", progress=False)
+    file.write_bytes(file.read_bytes()[:-500])
+    with pytest.raises(DatasetError, match="cannot be read to its end"):
+        import_minari(directory, tmp_path / "data", progress=False)
+    assert [path.name for path in tmp_path.iterdir()] == ["minari"]
+
+
+# --- the recipe -----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def recipe(monkeypatch):
+    monkeypatch.syspath_prepend(str(RECIPES))
+    return importlib.import_module("import_dataset")
+
+
+def configured(*overrides: str):
+    with initialize_config_dir(str(RECIPES / "configs"), version_base="1.3"):
+        return compose("import_dataset", overrides=list(overrides))
+
+
+def test_recipe_imports_and_sums_up(recipe, source, tmp_path):
+    overrides = [f"source={source}", f"path={tmp_path / 'data'}", "format=d4rl", "name=mine"]
+    dataset = recipe.import_dataset(configured(*overrides, "env_id=HalfCheetah-v2"))
+    assert dataset.metadata["name"] == "mine"
+    lines = recipe.summary(dataset).splitlines()
+    assert lines[0].endswith("13 transitions in 4 episodes")
+    mean = np.mean([each["reward"].sum() for each in EPISODES[:3]])
+    assert lines[1].startswith(f"returns: mean {mean:.1f}")
+    assert lines[2].endswith(f"{100 * (mean + 280.178953) / 12415.178953:.1f}")
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_recipe_takes_the_bounds_of_minari(recipe, tmp_path, monkeypatch):
+    directory = make_minari(tmp_path / "minari", monkeypatch)
+    dataset = recipe.import_dataset(
+        configured(f"source={directory}", f"path={tmp_path / 'data'}", "format=minari")
+    )
+    assert dataset.metadata["action_bounds"] == {"low": [-2, -2], "high": [3, 3]}
+
+
+def test_recipe_names_what_is_missing(recipe, source):
+    with pytest.raises(DatasetError, match=r"values for \['format', 'path'\]"):
+        recipe.import_dataset(configured(f"source={source}"))
+    with pytest.raises(DatasetError, match="format=csv: expected one of"):
+        recipe.import_dataset(configured(f"source={source}", "path=x", "format=csv"))
