@@ -19,7 +19,6 @@ from torchrl_aca import ACALoss, CriticGuidedDenoisingActor, NoiseLevelCritic, N
 from torchrl_aca.training.agent import Agent
 from torchrl_aca.training.checkpoint import Counters
 
-
 SCHEDULES = {
     "cosine": NoiseSchedule.cosine,
     "linear": NoiseSchedule.linear,
