@@ -135,7 +135,7 @@ def load_offline_data(cfg: DictConfig, env: EnvBase) -> TensorDictBase | ReplayB
         if got != expected:
             raise RunError(
                 f"dataset={cfg.dataset} has {name}s of length {got}; expected {expected}, as in "
-                f"{cfg.env.name}. It is of {dataset.metadata['env_id']}: choose the env of the data."
+                f"{cfg.env.name}. It is of {dataset.metadata['env_id']}: choose that env."
             )
     return dataset.data
 
@@ -143,7 +143,7 @@ def load_offline_data(cfg: DictConfig, env: EnvBase) -> TensorDictBase | ReplayB
 def make_mixture(
     cfg: DictConfig, offline: TensorDictBase | ReplayBuffer | None
 ) -> MixedReplayBuffer:
-    """The buffer that every minibatch is drawn from; rewards are scaled by the loss, in both halves."""
+    """The buffer that minibatches are drawn from. The loss scales the rewards of both halves."""
     try:
         return MixedReplayBuffer(
             offline,

@@ -5,30 +5,16 @@ from __future__ import annotations
 from functools import partial
 
 import torch
+from gaussian_policy import make_gaussian_policy
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.envs import EnvBase
-from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.modules import MLP, ValueOperator
 from torchrl.objectives import SACLoss, SoftUpdate
 
 from torchrl_aca.training.acceleration import capture, compiled, make_adam
 from torchrl_aca.training.agent import Agent
-
-
-class BoundedNormalParams(nn.Module):
-    """Splits (..., 2A) into a mean and a standard deviation whose logarithm is clamped."""
-
-    def __init__(self, log_std_min: float, log_std_max: float) -> None:
-        """Takes the bounds of the logarithm."""
-        super().__init__()
-        self.bounds = (log_std_min, log_std_max)
-
-    def forward(self, params: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns mean and standard deviation, (..., A) each."""
-        mean, log_std = params.chunk(2, dim=-1)
-        return mean, log_std.clamp(*self.bounds).exp()
 
 
 def make_sac(cfg: DictConfig, env: EnvBase, device: torch.device) -> Agent:
@@ -41,19 +27,12 @@ def make_sac(cfg: DictConfig, env: EnvBase, device: torch.device) -> Agent:
     if activation is None:
         raise ValueError(f"sac.activation={settings.activation}: expected a class of torch.nn.")
     mlp = {"num_cells": list(settings.num_cells), "activation_class": activation, "device": device}
-    actor_network = nn.Sequential(
+    policy = make_gaussian_policy(
         MLP(in_features=observation_dim, out_features=2 * action_dim, **mlp),
-        BoundedNormalParams(settings.log_std_min, settings.log_std_max),
-    )
-    policy = ProbabilisticActor(
-        TensorDictModule(actor_network, in_keys=["observation"], out_keys=["loc", "scale"]),
-        in_keys=["loc", "scale"],
-        spec=action_spec.to(device),
-        distribution_class=TanhNormal,
-        distribution_kwargs={
-            "low": action_spec.space.low.to(device),
-            "high": action_spec.space.high.to(device),
-        },
+        action_spec,
+        settings.log_std_min,
+        settings.log_std_max,
+        device,
     )
     critic = ValueOperator(
         MLP(in_features=observation_dim + action_dim, out_features=1, **mlp),

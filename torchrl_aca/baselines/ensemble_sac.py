@@ -1,0 +1,386 @@
+"""The loss of RLPD: soft actor-critic with many critics and targets from a few of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict.nn import TensorDictModule, dispatch
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torchrl.data import Bounded, Composite, TensorSpec
+from torchrl.modules import ProbabilisticActor
+from torchrl.modules.distributions.utils import rsample_and_log_prob
+from torchrl.objectives import LossModule, ValueEstimators
+from torchrl.objectives.utils import dispatch_value_estimator
+
+__all__ = ["EnsembleSACLoss"]
+
+# The temperature as a function of its parameter, and the way back.
+TEMPERATURES: dict[str, tuple[Callable[[Tensor], Tensor], Callable[[float], float]]] = {
+    "exp": (torch.exp, math.log),
+    "softplus": (nn.functional.softplus, lambda alpha: math.log(math.expm1(alpha))),
+}
+
+
+class EnsembleSACLoss(LossModule):
+    """Loss module of RLPD (*Efficient Online RL with Offline Data*, arXiv 2302.02948).
+
+    With critics ``Q_1..Q_E``, their targets ``Q_bar_i``, a random subset ``M`` of the members for
+    each call, the policy ``pi`` and its temperature ``alpha``, three losses, each to be had alone
+    as a TensorDict of its ``loss_*`` entry and metrics:
+
+    - :meth:`qvalue_loss`: ``mean_i (Q_i(s, a) - y)^2`` with ``y = r + gamma (1 - terminated)
+      (min_{i in M} Q_bar_i(s', a') - alpha log pi(a'|s'))``, ``a' ~ pi(.|s')``;
+    - :meth:`actor_loss`: ``alpha log pi(a|s) - mean_i Q_i(s, a)``, ``a ~ pi(.|s)``;
+    - :meth:`alpha_loss`: ``alpha * stop_grad(-log pi(a|s) - H_target)``.
+
+    :meth:`forward` gives all three. RLPD takes many critic steps for each step of actor and
+    temperature: call the methods one by one for that.
+
+    The defaults are RLPD's for locomotion. WSRL's authors (arXiv 2412.07762) compare with another
+    algorithm under this name: ``subset_with_replacement=True, actor_value="min",
+    entropy_backup=False, target_entropy_scale=1.0, temperature="softplus"``; it is their online SAC
+    as well. They measure the entropy of ``alpha_loss`` at next states, which is not done here.
+
+    Why not TorchRL's ``REDQLoss``: it has this target and this actor objective, but no critic loss
+    of its own, so twenty critic steps would pay for twenty actor passes; its temperature loss also
+    averages over next states, and its temperature is clamped to [0.1, 10] by default. ``SACLoss``
+    has separate losses, but takes the minimum over all critics.
+
+    Log-probabilities are those of the action rescaled to [-1, 1], as in RLPD, which rescales its
+    environments: so target entropy and temperature mean the same whatever the action's range.
+
+    Args:
+        actor_network: the policy. Its distribution must have ``rsample``.
+        qvalue_network: the critics as one module with a parameter stack, such as
+            ``ValueOperator(EnsembleMLP(...), in_keys=["observation", "action"])``: every parameter
+            has ``E`` as its first dimension, the output has the shape ``(*batch, E)``.
+
+    Keyword Args:
+        subset_size: number of members in ``M``. Default: 2.
+        subset_with_replacement: whether ``M`` may hold a member twice. Default: False.
+        actor_value: what the actor maximises, the ``"mean"`` or the ``"min"`` over all members.
+            Default: ``"mean"``.
+        entropy_backup: keep ``-alpha log pi(a'|s')`` in the target. Default: True.
+        target_entropy: ``H_target`` in nats, or ``"auto"`` for ``-target_entropy_scale * A``.
+        target_entropy_scale: default 0.5.
+        alpha_init: first temperature. Default: 1.0.
+        temperature: ``alpha`` is ``"exp"`` or ``"softplus"`` of the trained parameter,
+            ``raw_alpha``. Default: ``"exp"``.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"``; with ``"none"`` the losses have the shape of
+            the input and metrics are left out. Default: ``"mean"``.
+
+    Raises:
+        ValueError: on an unknown option, or a ``qvalue_network`` that is no stack.
+
+    Examples:
+        >>> from tensordict.nn import TensorDictModule
+        >>> from torchrl.data import Bounded
+        >>> from torchrl.modules import MLP, NormalParamExtractor, ProbabilisticActor
+        >>> from torchrl.modules import TanhNormal, ValueOperator
+        >>> from torchrl_aca.baselines import EnsembleMLP, EnsembleSACLoss
+        >>> network = torch.nn.Sequential(MLP(3, 4), NormalParamExtractor())
+        >>> actor = ProbabilisticActor(
+        ...     TensorDictModule(network, in_keys=["observation"], out_keys=["loc", "scale"]),
+        ...     in_keys=["loc", "scale"],
+        ...     spec=Bounded(-1.0, 1.0, (2,)),
+        ...     distribution_class=TanhNormal,
+        ... )
+        >>> critics = ValueOperator(EnsembleMLP(3 + 2), in_keys=["observation", "action"])
+        >>> loss = EnsembleSACLoss(actor, critics)
+        >>> updater = SoftUpdate(loss, tau=0.005)
+        >>> for _ in range(20):
+        ...     loss.qvalue_loss(data)["loss_qvalue"].backward()  # and a step, and a soft update
+        >>> loss.actor_loss(data)["loss_actor"].backward()
+        >>> loss.alpha_loss(data)["loss_alpha"].backward()
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that ``set_keys`` can change.
+
+        Attributes:
+            action: the action in the data.
+            value: where the value estimator finds the next state's value.
+            state_action_value: the critics' output.
+            log_prob: where :meth:`actor_loss` leaves its actions' log-probabilities, and
+                :meth:`alpha_loss` finds them.
+            reward: the reward, below ``"next"``.
+            done: the done flag, below ``"next"``.
+            terminated: the terminated flag, below ``"next"``.
+        """
+
+        action: NestedKey = "action"
+        value: NestedKey = "state_value"
+        state_action_value: NestedKey = "state_action_value"
+        log_prob: NestedKey = "policy_log_prob"
+        reward: NestedKey = "reward"
+        done: NestedKey = "done"
+        terminated: NestedKey = "terminated"
+
+    default_keys = _AcceptedKeys
+    tensor_keys: _AcceptedKeys
+    default_value_estimator = ValueEstimators.TD0
+    SUPPORTED_VALUE_ESTIMATORS = (ValueEstimators.TD0,)
+
+    actor_network: ProbabilisticActor
+    qvalue_network: TensorDictModule
+    qvalue_network_params: TensorDictParams
+    target_qvalue_network_params: TensorDictParams
+    target_entropy: Tensor
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticActor,
+        qvalue_network: TensorDictModule,
+        *,
+        subset_size: int = 2,
+        subset_with_replacement: bool = False,
+        actor_value: Literal["mean", "min"] = "mean",
+        entropy_backup: bool = True,
+        target_entropy: float | Literal["auto"] = "auto",
+        target_entropy_scale: float = 0.5,
+        alpha_init: float = 1.0,
+        temperature: Literal["exp", "softplus"] = "exp",
+        reduction: Literal["none", "mean", "sum"] | None = None,
+    ) -> None:
+        self._in_keys: list[NestedKey] | None = None
+        self._out_keys: list[str] | None = None
+        super().__init__()
+        self.num_qvalue_nets = _stack_size(qvalue_network)
+        _check_choice("actor_value", actor_value, ("mean", "min"))
+        _check_choice("temperature", temperature, tuple(TEMPERATURES))
+        if not 1 <= subset_size <= self.num_qvalue_nets:
+            raise ValueError(
+                f"subset_size must be from 1 to the number of critics ({self.num_qvalue_nets}), "
+                f"got {subset_size}."
+            )
+        if not alpha_init > 0:
+            raise ValueError(f"alpha_init must be > 0, got {alpha_init}.")
+        self.actor_network = actor_network
+        self.convert_to_functional(qvalue_network, "qvalue_network", create_target_params=True)
+        self.subset_size = subset_size
+        self.subset_with_replacement = subset_with_replacement
+        self.actor_value = actor_value
+        self.entropy_backup = entropy_backup
+        self.temperature = temperature
+        self.reduction = reduction or "mean"
+        self._policy_action_key = actor_network.dist_sample_keys[0]
+        self.set_keys(
+            action=self._policy_action_key, state_action_value=qvalue_network.out_keys[-1]
+        )
+        self._init_entropy(alpha_init, target_entropy, target_entropy_scale)
+
+    def _init_entropy(self, alpha_init: float, target: float | str, scale: float) -> None:
+        """The temperature's parameter, its target, and the scale on which entropy is measured."""
+        like = next(self.qvalue_network_params.parameters())
+        _, inverse = TEMPERATURES[self.temperature]
+        self.raw_alpha = nn.Parameter(like.new_tensor(inverse(alpha_init)))
+        spec = self._action_spec()
+        if target == "auto":
+            if spec is None:
+                raise ValueError(
+                    'target_entropy="auto" needs the size of the action: build the actor with '
+                    "spec=env.action_spec_unbatched, or give a number."
+                )
+            target = -scale * spec.shape[-1]
+        self.register_buffer("target_entropy", like.new_tensor(target))
+        log_half_range = like.new_zeros(())
+        if isinstance(spec, Bounded):
+            log_half_range = ((spec.space.high - spec.space.low) / 2).log().sum().to(like)
+        self.register_buffer("_log_half_range", log_half_range)
+
+    def _action_spec(self) -> TensorSpec | None:
+        spec = self.actor_network.spec
+        return spec.get(self._policy_action_key, None) if isinstance(spec, Composite) else spec
+
+    # --- the three losses -------------------------------------------------------------------------
+
+    def qvalue_loss(self, tensordict: TensorDictBase) -> TensorDict:
+        """TD loss of all critics."""
+        target = self._target_value(tensordict)
+        action = tensordict[self.tensor_keys.action]
+        value = self._values(self.qvalue_network_params, tensordict, action)
+        error = (value - target).square().mean(-1)
+        metrics = {"pred_value": value.detach().mean(), "target_value": target.mean()}
+        return self._output("loss_qvalue", error, tensordict, metrics)
+
+    def actor_loss(self, tensordict: TensorDictBase) -> TensorDict:
+        """Loss of the policy; writes its log-probabilities, ``(*batch,)``, to ``tensordict``."""
+        action, log_prob = self._sample(tensordict)
+        values = self._values(self.qvalue_network_params.data, tensordict, action)
+        value = values.mean(-1) if self.actor_value == "mean" else values.amin(-1)
+        tensordict.set(self.tensor_keys.log_prob, log_prob.detach())
+        metrics = {"entropy": -log_prob.detach().mean()}
+        return self._output("loss_actor", self.alpha * log_prob - value, tensordict, metrics)
+
+    def alpha_loss(self, tensordict: TensorDictBase) -> TensorDict:
+        """Loss of the temperature.
+
+        Args:
+            tensordict: what :meth:`actor_loss` has seen, so that the policy is not run again; or
+                any batch of observations, for which actions are drawn.
+        """
+        log_prob = tensordict.get(self.tensor_keys.log_prob, None)
+        if log_prob is None:
+            with torch.no_grad():
+                _, log_prob = self._sample(tensordict)
+        alpha = self._alpha()
+        error = alpha * (-log_prob - self.target_entropy)
+        return self._output("loss_alpha", error, tensordict, {"alpha": alpha.detach()})
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """All three losses and their metrics; see the class."""
+        out = self.qvalue_loss(tensordict)
+        out.update(self.actor_loss(tensordict))
+        out.update(self.alpha_loss(tensordict))
+        return out
+
+    @property
+    def alpha(self) -> Tensor:
+        """The temperature, without gradient."""
+        return self._alpha().detach()
+
+    # --- their parts ------------------------------------------------------------------------------
+
+    def _alpha(self) -> Tensor:
+        function, _ = TEMPERATURES[self.temperature]
+        return function(self.raw_alpha)
+
+    def _sample(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Reparametrised actions ``(*batch, A)`` in env units, and log-probabilities ``(*batch,)``.
+
+        The probability is of the very draw: recovering that from a rounded action would fail where
+        tanh saturates.
+        """
+        actor = self.actor_network
+        distribution = actor.get_dist(tensordict.select(*actor.in_keys))
+        action, log_prob = rsample_and_log_prob(distribution)
+        return action, log_prob + self._log_half_range
+
+    def _values(self, params: TensorDictBase, states: TensorDictBase, action: Tensor) -> Tensor:
+        """Critic values under ``params``, one per member in them: ``(*batch, members)``."""
+        critic = self.qvalue_network
+        data = states.select(*critic.in_keys, strict=False).set(self._policy_action_key, action)
+        with params.to_module(critic, preserve_module_state=False):
+            return critic(data)[self.tensor_keys.state_action_value]
+
+    def _subset(self) -> Tensor:
+        """Indices of the members in ``M``, drawn anew."""
+        num, device = self.num_qvalue_nets, self.raw_alpha.device
+        if self.subset_with_replacement:
+            return torch.randint(num, (self.subset_size,), device=device)
+        return torch.randperm(num, device=device)[: self.subset_size]
+
+    @torch.no_grad()
+    def _target_value(self, tensordict: TensorDictBase) -> Tensor:
+        """TD target ``y`` of shape ``(*batch, 1)``, made by the value estimator."""
+        keys = self.tensor_keys
+        next_action, log_prob = self._sample(tensordict["next"])
+        members = self._subset()
+        # Only the members in M are evaluated: with two of ten, a fifth of the work.
+        params = self.target_qvalue_network_params.data.apply(lambda stack: stack[members])
+        next_values = self._values(params, tensordict["next"], next_action)
+        next_value = next_values.amin(-1, keepdim=True)
+        if self.entropy_backup:
+            next_value = next_value - self.alpha * log_prob.unsqueeze(-1)
+        # A terminal state may hold anything, NaN included: its value is zero, not zero times that.
+        terminated = tensordict[_next(keys.terminated)]
+        next_value = next_value.masked_fill(terminated.reshape(next_value.shape), 0.0)
+        data = tensordict.clone(recurse=False)
+        data.set(_next(self.value_estimator.tensor_keys.value), next_value)
+        return self.value_estimator.value_estimate(data).reshape(next_value.shape)
+
+    def _output(
+        self, name: str, error: Tensor, tensordict: TensorDictBase, metrics: dict[str, Tensor]
+    ) -> TensorDict:
+        loss = self._reduce_loss(error, tensordict)
+        if self.reduction == "none":
+            return TensorDict({name: loss}, batch_size=tensordict.batch_size)
+        return TensorDict({name: loss, **metrics})
+
+    # --- the LossModule contract ------------------------------------------------------------------
+
+    def make_value_estimator(
+        self, value_type: ValueEstimators | None = None, **hyperparams: Any
+    ) -> Any:
+        """Set the value estimator, which can only be TD0; see ``LossModule``."""
+        value_type, hyperparams = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
+        if value_type is not None:
+            dispatch_value_estimator(
+                self,
+                value_type,
+                supported=self.SUPPORTED_VALUE_ESTIMATORS,
+                tensor_keys={"value_target": "value_target", **self._estimator_keys()},
+                value_network=None,
+                **hyperparams,
+            )
+        return self
+
+    def _estimator_keys(self) -> dict[str, NestedKey]:
+        names = ("value", "reward", "done", "terminated")
+        return {name: getattr(self.tensor_keys, name) for name in names}
+
+    def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
+        if self._value_estimator is not None:
+            self._value_estimator.set_keys(**self._estimator_keys())
+        self._in_keys = None
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Keys that the loss reads."""
+        if self._in_keys is None:
+            keys = self.tensor_keys
+            networks = [*self.actor_network.in_keys, *self.qvalue_network.in_keys]
+            states = [key for key in dict.fromkeys(networks) if key != self._policy_action_key]
+            self._in_keys = [
+                keys.action,
+                *states,
+                *(_next(key) for key in (keys.reward, keys.done, keys.terminated)),
+                *(_next(key) for key in states),
+            ]
+        return self._in_keys
+
+    @in_keys.setter
+    def in_keys(self, values: list[NestedKey]) -> None:
+        self._in_keys = values
+
+    @property
+    def out_keys(self) -> list[str]:
+        """The losses, then the metrics."""
+        if self._out_keys is None:
+            losses = ["loss_qvalue", "loss_actor", "loss_alpha"]
+            metrics = ["pred_value", "target_value", "entropy", "alpha"]
+            self._out_keys = losses if self.reduction == "none" else losses + metrics
+        return self._out_keys
+
+    @out_keys.setter
+    def out_keys(self, values: list[str]) -> None:
+        self._out_keys = values
+
+
+def _stack_size(network: nn.Module) -> int:
+    """The number of members of a stack of networks."""
+    sizes = {param.shape[0] if param.ndim else 0 for param in network.parameters()}
+    if len(sizes) != 1 or 0 in sizes:
+        raise ValueError(
+            "qvalue_network must be a stack of critics, in which every parameter has one entry per "
+            f"critic along its first dimension; got first dimensions {sizes}. "
+            "torchrl_aca.baselines.EnsembleMLP is one."
+        )
+    return sizes.pop()
+
+
+def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise ValueError(f"{name} must be one of {choices}, got {value!r}.")
+
+
+def _next(key: NestedKey) -> NestedKey:
+    return ("next", key) if isinstance(key, str) else ("next", *key)
