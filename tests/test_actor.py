@@ -621,8 +621,8 @@ def test_one_compiled_step_serves_acting_targets_and_evaluation(monkeypatch):
         actor.sample(observation, [num_states], num_candidates=num_candidates)
         with torch.no_grad(), DETERMINISTIC:
             act(actor, observe(num_states))
-    # Batches of one candidate have a version of their own: 50 states fill a tile.
-    assert len(compiled) == 2
+    # A step and a choice; tiles of one candidate have versions of their own: 50 states fill one.
+    assert len(compiled) == 4
 
 
 def test_a_compiled_step_acts_alike_at_every_level_and_stays_behind_in_copies(monkeypatch):
@@ -639,10 +639,10 @@ def test_a_compiled_step_acts_alike_at_every_level_and_stays_behind_in_copies(mo
     for seed in (0, 1):
         expected = act(plain, td, seed)
         torch.testing.assert_close(act(compiled, td, seed), expected, rtol=0, atol=1e-5)
-    assert len(compiled_steps) == 1
+    assert len(compiled_steps) == 2  # the step, and the choice among the candidates
     for copied in (copy.deepcopy(compiled), pickle.loads(pickle.dumps(compiled))):
         torch.testing.assert_close(act(copied, td, seed=1), expected, rtol=0, atol=1e-5)
-    assert len(compiled_steps) == 3
+    assert len(compiled_steps) == 6
 
 
 # --- collectors -----------------------------------------------------------------------------------

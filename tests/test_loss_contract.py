@@ -218,6 +218,19 @@ def test_compiled_loss_equals_eager(draws):
     torch.testing.assert_close(*results)
 
 
+def test_an_update_reads_no_value_and_stays_on_its_device():
+    """As a CUDA graph asks: on the device `meta`, which has no values, both would raise."""
+    loss = ACALoss(make_actor().to("meta"))
+    optimizer = torch.optim.Adam(loss.qvalue_network.parameters())
+    data = make_data(4).to("meta")
+    data["next_action"] = loss.sample_next_action(data)
+    for losses in (loss.qvalue_loss(data), loss.noise_level_loss(data), loss.alpha_loss()):
+        sum(value for name, value in losses.items() if name.startswith("loss")).backward()
+    optimizer.step()
+    devices = {param.grad.device.type for param in loss.parameters() if param.requires_grad}
+    assert devices == {"meta"} == {data["td_error"].device.type}
+
+
 # --- arguments ------------------------------------------------------------------------------------
 
 

@@ -68,8 +68,9 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         alpha_init: initial ``alpha``. Default: 5.
         clip_action: clip the action to the spec's bounds. Default: False; as in the official
             code, exploration noise may leave the box, and the loss learns from such actions.
-        compile_step: run the denoising step through ``torch.compile``: seconds of compilation at
-            the first call, faster steps afterwards, for any number of rows. Default: False.
+        compile_step: run the denoising step, and the choice among the candidates, through
+            ``torch.compile``: seconds of compilation at the first call, faster steps afterwards,
+            for any number of rows. Default: False.
         tile_rows: rows (states times candidates) that a CPU takes through the chain at once, at
             least one candidate of every state. It changes cost, not the result. Default: 1024.
         in_keys: keys of the observations. Default: those of the critic.
@@ -280,24 +281,32 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         return F.normalize_gradient(gradient) if self.normalize_gradient else gradient
 
     def _step(self, features: Any, action: Tensor, noise: Tensor, step: Tensor) -> Tensor:
-        """The sampler's step, compiled on first use where the actor was built so."""
+        return self._run("_chain_step", features, action, noise, step)
+
+    def _clean_values(self, features: Any, candidates: Tensor) -> Tensor:
+        """Values at level 0, by which the best of N is chosen."""
+        clean = torch.zeros((), dtype=torch.long, device=candidates.device)
+        return self.critic.evaluate(features, candidates, clean)
+
+    def _run(self, method: str, features: Any, *inputs: Tensor) -> Tensor:
+        """Calls a method, compiled on first use where the actor was built so."""
         if not self.compile_step or torch.compiler.is_compiling():
-            return self._chain_step(features, action, noise, step)
-        if "_compiled_step" not in self.__dict__:
-            self.__dict__["_compiled_step"] = torch.compile(self._chain_step, dynamic=True)
+            return getattr(self, method)(features, *inputs)
+        compiled = self.__dict__.setdefault("_compiled", {})
+        if method not in compiled:
+            compiled[method] = torch.compile(getattr(self, method), dynamic=True)
         # Dynamic, and on copies: acting, targets and evaluation differ in rows, and code compiled
         # for a view depends on the tensor behind it. Each would be compiled anew.
-        inputs = (tensor.clone() for tensor in (action, noise, step))
-        return self.__dict__["_compiled_step"](features, *inputs)
+        return compiled[method](features, *(tensor.clone() for tensor in inputs))
 
     def __getstate__(self) -> dict[str, Any]:
         """Copies and workers compile for themselves: compiled code does not travel."""
-        return {key: value for key, value in self.__dict__.items() if key != "_compiled_step"}
+        return {key: value for key, value in self.__dict__.items() if key != "_compiled"}
 
     def _select(self, features: Any, candidates: Tensor) -> Tensor:
-        clean = torch.zeros((), dtype=torch.long, device=candidates.device)
-        tiles = candidates.split(self._candidates_per_tile(candidates))
-        values = torch.cat([self.critic.evaluate(features, tile, clean) for tile in tiles])
+        with torch.no_grad():
+            tiles = candidates.split(self._candidates_per_tile(candidates))
+            values = torch.cat([self._run("_clean_values", features, tile) for tile in tiles])
         return F.select_best(candidates, values)
 
     # --- acting -----------------------------------------------------------------------------------
