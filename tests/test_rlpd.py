@@ -239,7 +239,9 @@ def test_every_subset_is_drawn_and_only_with_replacement_a_member_twice(variant,
     subsets = list(combinations_with_replacement(range(MEMBERS), 2))
     for seed in range(60):
         value, noise = seeded(loss.qvalue_loss, data, seed=seed)["loss_qvalue"], noise_of(seed)
-        drawn |= {s for s in subsets if np.isclose(oracle.qvalue_loss(noise, s), value.item())}
+        fitting = [s for s in subsets if np.isclose(oracle.qvalue_loss(noise, s), value.item())]
+        if len(fitting) == 1:  # more, where one member is below the other in every row
+            drawn.add(fitting[0])
     assert drawn == set(allowed(range(MEMBERS), 2))
 
 
