@@ -39,6 +39,7 @@ def make_rlpd(cfg: DictConfig, env: EnvBase, device: torch.device) -> Agent:
     actor_optimizer = make_adam(loss.actor_network.parameters(), optim.actor_lr, cfg)
     alpha_optimizer = make_adam([loss.raw_alpha], optim.alpha_lr, cfg)
     recent, progress = RecentStates(settings.num_actor_batches, device), Counters()
+    actor_interval = settings.actor_interval  # not in the update: an interpolation takes its time
     qvalue_loss, actor_loss = compiled(loss.qvalue_loss, cfg), compiled(loss.actor_loss, cfg)
 
     def descend(
@@ -65,7 +66,7 @@ def make_rlpd(cfg: DictConfig, env: EnvBase, device: torch.device) -> Agent:
         metrics = critic_step(batch)
         recent.add(batch)
         progress.updates += 1
-        if progress.updates % settings.actor_interval == 0:
+        if progress.updates % actor_interval == 0:
             metrics.update(actor_step(recent.joined()))
         return metrics
 

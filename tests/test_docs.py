@@ -141,23 +141,36 @@ def flat(node: DictConfig, prefix: str = "") -> dict[str, object]:
     return out
 
 
-def table_rows(page: str) -> list[list[str]]:
-    lines = [line for line in (DOCS / page).read_text().splitlines() if line.startswith("| `")]
+def table_rows(page: str, section: str = "") -> list[list[str]]:
+    text = (DOCS / page).read_text()
+    if section:
+        text = text.partition(f"\n## {section}\n")[2].partition("\n## ")[0]
+    lines = [line for line in text.splitlines() if line.startswith("| `")]
     return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines]
 
 
 def test_config_page_has_every_key_with_its_default():
     files = [*sorted((CONFIGS / "algo").glob("*.yaml"))]
-    assert [file.stem for file in files] == ["aca", "sac"]
-    aca, sac = flat(composed()), flat(composed("algo=sac"))
+    assert [file.stem for file in files] == ["aca", "rlpd", "sac"]
+    configs = [flat(composed(f"algo={name}")) for name in ("aca", "sac", "rlpd")]
     documented: dict[str, list[object]] = {}
     for key, default, *_ in table_rows("config.md"):
         documented.setdefault(key.strip("`"), []).append(yaml.safe_load(default.strip("`")))
-    assert documented.keys() == aca.keys() | sac.keys()
+    assert documented.keys() == set().union(*configs)
     for key, values in documented.items():
-        configured = [plain(c[key]) for c in (aca, sac) if key in c]
+        configured = [plain(config[key]) for config in configs if key in config]
         assert all(value in configured for value in values), (key, values, configured)
         assert configured[0] == values[0], (key, values, configured)
+
+
+def test_config_page_has_both_variants_of_rlpd():
+    variants = flat(composed("algo=rlpd")), flat(composed("algo=rlpd", "variant=wsrl"))
+    rows = {key.strip("`"): values for key, *values, _ in table_rows("config.md", "RLPD")}
+    differing = {key for key, value in variants[0].items() if value != variants[1][key]}
+    assert differing - {"variant.name"} <= rows.keys()
+    for key, values in rows.items():
+        documented = [yaml.safe_load(value.strip("`")) for value in values]
+        assert documented == [plain(variant[key]) for variant in variants], key
 
 
 def plain(value: object) -> object:
@@ -166,9 +179,13 @@ def plain(value: object) -> object:
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
-    """Directories of two tiny runs, by algorithm."""
+    """Directories of tiny runs, by algorithm."""
     folder = tmp_path_factory.mktemp("runs")
-    sizes = {"aca": ["aca.num_candidates=2", "aca.num_target_candidates=2"], "sac": []}
+    sizes = {
+        "aca": ["aca.num_candidates=2", "aca.num_target_candidates=2"],
+        "sac": [],
+        "rlpd": ["optim.utd_ratio=1"],
+    }
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         patch.syspath_prepend(str(ROOT / "recipes"))

@@ -62,7 +62,7 @@ PathFinder.find_spec = find_installed
 try:
     import gymnasium
 except ModuleNotFoundError:
-    import {PACKAGE}, {PACKAGE}.offline
+    import {PACKAGE}, {PACKAGE}.baselines, {PACKAGE}.offline
     assert {PACKAGE}.__all__
 else:
     sys.exit("the extras were not hidden")
@@ -117,6 +117,16 @@ def test_offline_data_know_no_algorithm() -> None:
     assert files
     for path in files:
         assert imported_parts(path) <= {"offline", "training", "checks"}, path.name
+
+
+def test_baselines_stand_beside_aca() -> None:
+    """They may use its equations and the seam of the training, not its critic, actor and loss."""
+    files = sorted((ROOT / PACKAGE / "baselines").rglob("*.py"))
+    assert files
+    for path in files:
+        assert imported_parts(path) <= {"baselines", "functional", "schedule", "training"}, path
+        training = {name for name in imported_modules(path) if ".training." in name}
+        assert all(".training.agent." in name for name in training), path
 
 
 def test_package_never_imports_recipes() -> None:

@@ -51,6 +51,15 @@ TINY_ACA = [
     *TINY_RUN,
 ]
 
+TINY_RLPD = [
+    "algo=rlpd",
+    "rlpd.num_cells=[16,16]",
+    "rlpd.num_qvalue_nets=3",
+    "rlpd.actor_interval=7",  # so that the run stops between two steps of the actor
+    *TINY_RUN,
+    "optim.utd_ratio=0.4",
+]
+
 
 def start(*arguments: str, cwd: Path) -> subprocess.Popen:
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
@@ -198,6 +207,17 @@ def test_aca_stop_and_resume_equals_never_stopping(tmp_path):
     check_stop_and_resume(TINY_ACA, tmp_path / "unbroken", tmp_path)
 
 
+@pytest.mark.parametrize("variant", ["rlpd", "wsrl"])
+def test_rlpd_stop_and_resume_equals_never_stopping(train, variant, tmp_path):
+    settings = [*TINY_RLPD, f"variant={variant}"]
+    unbroken = train(composed(*settings, f"run_dir={tmp_path / 'unbroken'}"))
+    train(composed(*settings, f"run_dir={tmp_path / 'here'}", "optim.total_updates=34"))
+    typed = [f"resume={tmp_path / 'here'}", "optim.total_updates=60"]
+    resumed = train(*resumed_config(composed("algo=rlpd", *typed), typed))
+    assert_same_state(unbroken, resumed)
+    assert without_time(unbroken / "metrics.csv") == without_time(resumed / "metrics.csv")
+
+
 def test_ctrl_c_leaves_a_checkpoint_that_resumes(unbroken, tmp_path):
     arguments = [*TINY, "optim.total_updates=100000", "run_dir=here", "checkpoint.interval=100000"]
     process = start(*arguments, cwd=tmp_path)
@@ -258,6 +278,31 @@ def test_bad_settings_of_aca_are_refused_before_any_work(train, tmp_path, overri
     with pytest.raises(RunError, match=message):
         train(cfg)
     assert not (tmp_path / "here").exists()
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("optim.utd_ratio=0.5", "rlpd.actor_interval=0.5: expected a positive integer"),
+        ("optim.actor_lr=0", "optim.actor_lr=0: expected a number above 0"),
+        ("rlpd.subset_size=11", "cannot be built: subset_size must be from 1 to .*10.*, got 11"),
+        ("rlpd.init=zeros", "rlpd.init=zeros: expected one of.*orthogonal"),
+    ],
+)
+def test_bad_settings_of_rlpd_are_refused_before_any_work(train, tmp_path, override, message):
+    cfg = composed("algo=rlpd", "env=hopper", f"run_dir={tmp_path / 'here'}", override)
+    with pytest.raises(RunError, match=message):
+        train(cfg)
+    assert not (tmp_path / "here").exists()
+
+
+def test_a_variant_belongs_to_rlpd_and_stays_that_of_the_run(train, tmp_path):
+    with pytest.raises(HydraException, match="variant"):
+        composed("algo=sac", "variant=wsrl")
+    run_dir = train(composed(*TINY_RLPD, f"run_dir={tmp_path / 'here'}", "optim.total_updates=2"))
+    typed = [f"resume={run_dir}", "variant=wsrl"]
+    with pytest.raises(RunError, match="variant.name=wsrl.*run to resume has variant.name=rlpd"):
+        resumed_config(composed("algo=rlpd", *typed), typed)
 
 
 def test_wandb_without_login_is_refused(train, tmp_path, monkeypatch):
@@ -388,7 +433,7 @@ def test_tensorboard_and_video(train, tmp_path):
 def test_every_configuration_composes_and_its_environment_is_built():
     tasks = sorted(path.stem for path in (CONFIGS / "env").glob("*.yaml"))
     algorithms = sorted(path.stem for path in (CONFIGS / "algo").glob("*.yaml"))
-    assert len(tasks) == 10 and {"aca", "sac"} <= set(algorithms)
+    assert len(tasks) == 10 and {"aca", "rlpd", "sac"} <= set(algorithms)
     for task in tasks:
         cfg = composed(f"env={task}")
         observation, _ = make_env(cfg.env.name).reset(seed=0)

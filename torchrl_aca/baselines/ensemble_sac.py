@@ -276,7 +276,7 @@ class EnsembleSACLoss(LossModule):
         num, device = self.num_qvalue_nets, self.raw_alpha.device
         if self.subset_with_replacement:
             return torch.randint(num, (self.subset_size,), device=device)
-        return torch.randperm(num, device=device)[: self.subset_size]
+        return torch.rand(num, device=device).topk(self.subset_size).indices
 
     @torch.no_grad()
     def _target_value(self, tensordict: TensorDictBase) -> Tensor:
@@ -293,7 +293,7 @@ class EnsembleSACLoss(LossModule):
         # A terminal state may hold anything, NaN included: its value is zero, not zero times that.
         terminated = tensordict[_next(keys.terminated)]
         next_value = next_value.masked_fill(terminated.reshape(next_value.shape), 0.0)
-        data = tensordict.clone(recurse=False)
+        data = tensordict.select(*map(_next, (keys.reward, keys.done, keys.terminated)))
         data.set(_next(self.value_estimator.tensor_keys.value), next_value)
         return self.value_estimator.value_estimate(data).reshape(next_value.shape)
 

@@ -1,0 +1,162 @@
+"""RLPD as the recipe makes it: who is trained when, on what, and what a checkpoint carries."""
+
+from __future__ import annotations
+
+import copy
+import importlib
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from tensordict import TensorDict
+from torch import nn
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from torchrl_aca.training.envs import make_vector_env
+
+RECIPES = Path(__file__).parents[1] / "recipes"
+INTERVAL, BATCH = 4, 16
+
+
+@pytest.fixture(scope="module")
+def make_agent():
+    env = make_vector_env("InvertedPendulum-v4", 1, 0)  # 4 observations, an action in [-3, 3]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(RECIPES))
+        make_rlpd = importlib.import_module("agents").AGENTS["rlpd"]
+
+    def make(*overrides, seed=0):
+        with initialize_config_dir(str(RECIPES / "configs"), version_base="1.3"):
+            cfg = compose("online_mujoco", ["algo=rlpd", *overrides])
+        torch.manual_seed(seed)
+        return make_rlpd(cfg, env, torch.device("cpu"))
+
+    return make
+
+
+def small(variant):
+    return [
+        f"variant={variant}",
+        "rlpd.num_cells=[16,16]",
+        "rlpd.num_qvalue_nets=5",
+        f"optim.utd_ratio={INTERVAL}",
+    ]
+
+
+def batch_of(seed, size=BATCH):
+    """Bandit-like: any state, an episode of one step, and the best action is 1.5."""
+    generator = torch.Generator().manual_seed(seed)
+    action = 6 * torch.rand(size, 1, generator=generator) - 3
+    ended = torch.ones(size, 1, dtype=torch.bool)
+    following = {
+        "observation": torch.randn(size, 4, generator=generator),
+        "reward": -((action - 1.5) ** 2),
+        "done": ended,
+        "terminated": ended,
+    }
+    return TensorDict(
+        observation=torch.randn(size, 4, generator=generator),
+        action=action,
+        next=following,
+        batch_size=[size],
+    )
+
+
+def run(agent, updates, size=BATCH):
+    metrics = []
+    for i in updates:
+        torch.manual_seed(i)  # what the loop's checkpoint restores
+        metrics.append(agent.update(batch_of(i, size)))
+    return metrics
+
+
+def state_of(agent):
+    # A copy, as a checkpoint file is one.
+    return copy.deepcopy({name: part.state_dict() for name, part in agent.state.items()})
+
+
+def copies(module_or_params):
+    return [param.detach().clone() for param in module_or_params]
+
+
+def changed(before, after):
+    return [not torch.equal(a, b) for a, b in zip(before, after, strict=True)]
+
+
+@pytest.mark.parametrize("variant", ["rlpd", "wsrl"])
+def test_every_update_trains_the_critics_and_every_fourth_the_actor(make_agent, variant):
+    agent = make_agent(*small(variant))
+    loss = agent.state["loss"]
+    for i in range(1, 9):
+        critics = copies(loss.qvalue_network_params.parameters())
+        targets = copies(loss.target_qvalue_network_params.values(True, True))
+        others = copies([loss.raw_alpha, *loss.actor_network.parameters()])
+        (metrics,) = run(agent, [i])
+        assert all(changed(critics, loss.qvalue_network_params.parameters()))
+        assert all(changed(targets, loss.target_qvalue_network_params.values(True, True)))
+        trained = changed(others, [loss.raw_alpha, *loss.actor_network.parameters()])
+        assert all(trained) if i % INTERVAL == 0 else not any(trained)
+        assert ("loss_actor" in metrics and "loss_alpha" in metrics) == (i % INTERVAL == 0)
+        assert not any(value.requires_grad for value in metrics.values())
+
+
+@pytest.mark.parametrize(("variant", "num_batches"), [("rlpd", 1), ("wsrl", INTERVAL)])
+def test_the_actor_sees_the_last_batch_or_all_since_its_last_step(make_agent, variant, num_batches):
+    agent = make_agent(*small(variant))
+    seen = []
+    network = agent.policy.module[0].module[0]
+    network.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    run(agent, range(2 * INTERVAL))
+    last = range(2 * INTERVAL - num_batches, 2 * INTERVAL)
+    expected = torch.cat([batch_of(i)["observation"] for i in last])
+    torch.testing.assert_close(seen[-1], expected, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("variant", ["rlpd", "wsrl"])
+def test_a_restored_agent_goes_on_as_if_never_stopped(make_agent, variant):
+    agent, other = make_agent(*small(variant)), make_agent(*small(variant), seed=1)
+    run(agent, range(6))  # between two steps of the actor
+    for name, state in state_of(agent).items():
+        other.state[name].load_state_dict(state)
+    for one, two in zip(run(agent, range(6, 12)), run(other, range(6, 12)), strict=True):
+        torch.testing.assert_close(one, two, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("variant", ["rlpd", "wsrl"])
+def test_the_same_seed_gives_the_same_agent(make_agent, variant):
+    first, second = (make_agent(*small(variant)) for _ in "12")
+    run(first, range(8)), run(second, range(8))
+    torch.testing.assert_close(state_of(first), state_of(second), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("variant", ["rlpd", "wsrl"])
+def test_the_best_action_of_a_bandit_is_found(make_agent, variant):
+    fast = ["optim.lr=1e-2", "optim.actor_lr=1e-2", "rlpd.alpha_init=0.3"]
+    agent = make_agent(*small(variant), *fast)
+    states = TensorDict(observation=torch.randn(200, 4), batch_size=[200])
+
+    def distance():
+        with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+            return (agent.policy(states.clone())["action"] - 1.5).abs().mean()
+
+    before = distance()
+    run(agent, range(450), size=64)
+    assert before > 0.9 and distance() < 0.3
+
+
+def test_the_variants_differ_in_normalisation_and_initialisation(make_agent):
+    for variant, actor_norms in (("rlpd", 0), ("wsrl", 2)):
+        loss = make_agent(f"variant={variant}").state["loss"]
+        norms = [m for m in loss.actor_network.modules() if isinstance(m, nn.LayerNorm)]
+        assert len(norms) == actor_norms
+        stacks = loss.qvalue_network_params["module", "layers"]
+        hidden, gain = stacks["3", "weight"][7], 1.0 if variant == "rlpd" else 1e-2
+        if variant == "rlpd":
+            bound = (6 / 512) ** 0.5
+            assert 0.99 * bound < hidden.abs().max() <= bound
+        else:
+            torch.testing.assert_close(hidden @ hidden.mT, gain**2 * torch.eye(256))
+        linears = [m for m in loss.actor_network.modules() if isinstance(m, nn.Linear)]
+        assert [tuple(m.weight.shape) for m in linears] == [(256, 4), (256, 256), (2, 256)]
+        assert not any(m.bias.any() for m in linears)
