@@ -109,9 +109,10 @@ def updates_due(cfg: DictConfig, frames: int) -> int:
 
 
 def make_device(cfg: DictConfig) -> torch.device:
-    """Sets the number of threads and returns the device; "auto" is CUDA where there is one."""
+    """Sets threads and precision and returns the device; "auto" is CUDA where there is one."""
     if cfg.num_threads is not None:
         torch.set_num_threads(cfg.num_threads)
+    torch.set_float32_matmul_precision(cfg.matmul_precision)
     name = cfg.device
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"

@@ -270,6 +270,7 @@ def test_bad_configurations_are_refused_before_any_work(train, tmp_path, overrid
         ("aca.num_candidates=-1", "num_candidates=-1.*positive integer"),
         ("optim.lr_end=0", "optim.lr_end=0: expected a number above 0"),
         ("aca.schedule=steep", "aca.schedule=steep: expected one of.*cosine"),
+        ("matmul_precision=fast", "matmul_precision=.fast.: expected one of"),
         ("aca.first_level=3", "cannot be built: first_level must be 0 or 1, got 3"),
     ],
 )

@@ -112,7 +112,8 @@ class _StackedLinear(nn.Module):
         nn.init.zeros_(self.bias)
 
     def forward(self, x: Tensor) -> Tensor:
-        return torch.baddbmm(self.bias, x, self.weight)
+        # Not baddbmm, which first fills its output with the bias: a compiler can fuse the sum.
+        return (x @ self.weight).add_(self.bias)
 
 
 class NoiseLevelCritic(NoiseLevelCriticBase):

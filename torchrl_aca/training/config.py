@@ -27,6 +27,7 @@ RANGES = {
 }
 MAY_CHANGE_ON_RESUME = ("optim.total_updates", "num_threads", "logger", "checkpoint", "video")
 NOT_COMPARED = (*MAY_CHANGE_ON_RESUME, "resume", "run_dir")
+PRECISIONS = ("highest", "high", "medium")
 LOGGERS = ("csv", "wandb", "tensorboard", "none")
 
 
@@ -38,6 +39,8 @@ def validate(cfg: DictConfig, algorithms: Iterable[str]) -> None:
     """
     _require(cfg.algo.name in algorithms, cfg, "algo.name", f"one of {sorted(algorithms)}")
     _require(cfg.logger.backend in LOGGERS, cfg, "logger.backend", f"one of {list(LOGGERS)}")
+    precision = f"one of {list(PRECISIONS)}"
+    _require(cfg.matmul_precision in PRECISIONS, cfg, "matmul_precision", precision)
     counts, rates = _counts_and_rates(cfg)
     for key in (*POSITIVE_INTEGERS, *counts):
         value = OmegaConf.select(cfg, key)
