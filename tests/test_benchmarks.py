@@ -65,3 +65,16 @@ def test_the_report_divides_by_yardstick_and_roofline():
     assert "| product | roofline | 1000.0 ms |  | 100 GFLOP/s |" in text
     assert "| chain | yardstick | 8000.0 ms | 1.00 | 25% |" in text
     assert "| chain | compiled | 2500.0 ms | 3.20 | 80% |" in text
+
+
+def test_the_report_tells_what_the_loop_costs():
+    from report import loop_overhead
+
+    def part(name, seconds, variant="compiled"):
+        info = {"case": f"iteration, N = 1: {name}", "variant": variant}
+        return {"extra_info": info, "stats": {"median": seconds}}
+
+    results = [part("whole", 0.1), part("acting, 5 states x 32", 0.03), part("update", 0.06)]
+    assert "(compiled)" in loop_overhead(results)
+    assert "takes 10.0 of 100.0 ms, 10%" in loop_overhead(results)
+    assert loop_overhead([part("update", 0.06)]) == ""
