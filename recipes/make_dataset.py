@@ -61,6 +61,7 @@ def make_dataset(cfg: DictConfig) -> OfflineDataset:
         env.observation_space.shape[0],
         env.action_space.shape[0],
         action_bounds=(env.action_space.low.tolist(), env.action_space.high.tolist()),
+        allow_constant=("observation", "reward"),  # some tasks are like that, and the loop is ours
     ) as writer:
         for episode in episodes_of(cfg, env, source):
             writer.add_episode(**episode)
