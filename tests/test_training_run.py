@@ -180,6 +180,7 @@ def iterate(cfg, returns, updates_per_iteration=5):
         while not last:
             start = counters.updates
             counters.updates += updates_per_iteration
+            counters.frames += 1
             last = run.end_iteration(start, lambda: {"loss": 0.5}, evaluation)
         run.finish(completed=True)
     return counters.updates, rows_of(run.dir / "metrics.csv"), rows_of(run.dir / "eval.csv")
