@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import hydra
 import torch
@@ -59,7 +61,7 @@ def generate_missing(cfg: DictConfig) -> None:
         message = str(error).splitlines()[0]
         raise RunError(f"generate: {message}; expected keys of make_dataset.yaml.") from None
     recipe.path = str(dataset_path(cfg))
-    print(f"generating {recipe.path} (tier {recipe.tier})", flush=True)
+    print(f"generating {recipe.path}", flush=True)
     make_dataset(recipe)
 
 
@@ -73,7 +75,13 @@ def load_offline_data(cfg: DictConfig, env: EnvBase) -> OfflineDataset | None:
     if not cfg.offline_fraction:
         return None
     dataset = OfflineDataset.load(dataset_path(cfg))
-    metadata, actions = dataset.metadata, env.action_spec_unbatched
+    require_fit(cfg, dataset.metadata, env)
+    return dataset
+
+
+def require_fit(cfg: DictConfig, metadata: Mapping[str, Any], env: EnvBase) -> None:
+    """Raises `RunError` unless task, sizes and actions of a data set are those of `env`."""
+    actions = env.action_spec_unbatched
     source, name = metadata["env_id"], f"dataset={cfg.dataset}"
     if source is not None and task_name(source) != task_name(cfg.env.name):
         raise RunError(
@@ -94,7 +102,6 @@ def load_offline_data(cfg: DictConfig, env: EnvBase) -> OfflineDataset | None:
             f"{actions.space.low.tolist()} and {actions.space.high.tolist()}, which {cfg.env.name} "
             "takes. Rescale them, or import the data with the environment's action_bounds."
         )
-    return dataset
 
 
 def make_mixture(cfg: DictConfig, dataset: OfflineDataset | None) -> MixedReplayBuffer:

@@ -277,6 +277,7 @@ def test_the_quickstart_differs_from_the_recipe_in_size_alone():
         (["utd=0.01"], "optim.total_updates=0: expected a positive integer"),
         (["algo=rlpd", "utd=0.5"], "rlpd.actor_interval=0.5: expected a positive integer"),
         (["dataset=none", "generate={tiers: random}"], "generate: Key 'tiers'.*make_dataset.yaml"),
+        (["dataset=none", "generate={episodes: 5}"], "tier=None: expected one of"),
         (["dataset=none", "generate={tier: expert}"], "tier=expert: expected one of"),
     ],
 )
