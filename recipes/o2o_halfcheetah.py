@@ -18,23 +18,15 @@ from typing import Any
 import hydra
 from agents import AGENTS
 from hydra.core.hydra_config import HydraConfig
+from offline_data import generate_missing, load_offline_data, make_mixture, offline_facts
 from omegaconf import DictConfig
 from online_mujoco import make_agent, make_collector, make_device, report_extras, updates_due
-from tensordict import TensorDictBase
-from torchrl.data import ReplayBuffer
-from torchrl.data.datasets import load_dataset
-from torchrl.envs import EnvBase
 
-from torchrl_aca.offline import DatasetError, MixedReplayBuffer, OfflineDataset, reference_scores
+from torchrl_aca.offline import DatasetError, reference_scores
 from torchrl_aca.offline.scores import normalized_score
 from torchrl_aca.training.checkpoint import Counters, restore
-from torchrl_aca.training.config import resumed_config, validate
-from torchrl_aca.training.data import (
-    TRANSITION_KEYS,
-    EpisodeTracker,
-    make_replay_buffer,
-    transitions,
-)
+from torchrl_aca.training.config import require, resumed_config, validate
+from torchrl_aca.training.data import EpisodeTracker, transitions
 from torchrl_aca.training.envs import EnvState, make_vector_env
 from torchrl_aca.training.errors import RunError
 from torchrl_aca.training.evaluation import evaluate
@@ -45,18 +37,18 @@ from torchrl_aca.training.run import Run
 
 def train(cfg: DictConfig, checkpoint: dict[str, Any] | None = None) -> Path:
     """Trains one agent, from the start or from a checkpoint, and returns the run directory."""
-    if cfg.optim.total_updates is None:
-        cfg.optim.total_updates = int(cfg.utd * cfg.online_frames)
+    complete(cfg)
     validate(cfg, AGENTS)
     require_wandb_login(cfg.logger)
+    generate_missing(cfg)
     device = make_device(cfg)
     seed_everything(cfg.seed)
 
     env = make_vector_env(cfg.env.name, cfg.collector.num_envs, cfg.seed)
     eval_env = make_vector_env(cfg.env.name, cfg.eval.episodes, cfg.eval.seed)
     agent = make_agent(cfg, env, device)
-    offline = load_offline_data(cfg, env)
-    buffer = make_mixture(cfg, offline)
+    dataset = load_offline_data(cfg, env)
+    buffer = make_mixture(cfg, dataset)
     episodes, means, counters = EpisodeTracker(cfg.collector.num_envs), MetricMeans(), Counters()
     parts = {
         **{f"agent.{name}": part for name, part in agent.state.items()},
@@ -78,13 +70,12 @@ def train(cfg: DictConfig, checkpoint: dict[str, Any] | None = None) -> Path:
 
     def evaluation() -> dict[str, float]:
         result = evaluate(agent.policy, eval_env, cfg.eval.seed, device)
-        scores = reference_scores(cfg.env.name)
-        if scores:
+        if scores := reference_scores(cfg.env.name):
             result["normalized_score"] = normalized_score(result["return_mean"], scores)
         return result
 
-    facts = {"offline data": f"{cfg.dataset}, {cfg.offline_fraction} of a batch", "UTD": cfg.utd}
-    with Run(cfg, parts, counters, resumed=checkpoint is not None, facts=facts) as run:
+    facts = {**offline_facts(dataset, buffer), "updates per online frame": cfg.optim.utd_ratio}
+    with Run(cfg, parts, counters, checkpoint is not None, __file__, facts) as run:
         if counters.frames == 0:
             run.log_evaluation(evaluation())
         # Offline phase: a method that has one makes its updates here, on the data set alone.
@@ -111,60 +102,30 @@ def train(cfg: DictConfig, checkpoint: dict[str, Any] | None = None) -> Path:
     return run.dir
 
 
-def load_offline_data(cfg: DictConfig, env: EnvBase) -> TensorDictBase | ReplayBuffer | None:
-    """The data set, or None where no minibatch has a part of it.
+def complete(cfg: DictConfig) -> None:
+    """Checks the keys that are this recipe's own, and sets the number of updates.
 
     Raises:
-        RunError: If there is none, or it was made in an environment of other sizes.
+        RunError: Naming the key, what was expected and what was got.
     """
-    if not cfg.offline_fraction:
-        return None
-    if cfg.dataset is None:
-        raise RunError(
-            "dataset=null: expected the directory of a data set, or an id such as aca:NAME. Make "
-            "one with recipes/make_dataset.py, or learn without: offline_fraction=0."
-        )
-    if ":" in cfg.dataset:
-        return load_dataset(cfg.dataset, batch_size=cfg.optim.batch_size)
-    dataset = OfflineDataset.load(cfg.dataset)
-    for name, spec in (
-        ("observation", env.observation_spec["observation"]),
-        ("action", env.action_spec),
-    ):
-        got, expected = dataset.metadata[f"{name}_dim"], spec.shape[-1]
-        if got != expected:
-            raise RunError(
-                f"dataset={cfg.dataset} has {name}s of length {got}; expected {expected}, as in "
-                f"{cfg.env.name}. It is of {dataset.metadata['env_id']}: choose that env."
-            )
-    return dataset.data
-
-
-def make_mixture(
-    cfg: DictConfig, offline: TensorDictBase | ReplayBuffer | None
-) -> MixedReplayBuffer:
-    """The buffer that minibatches are drawn from. The loss scales the rewards of both halves."""
-    try:
-        return MixedReplayBuffer(
-            offline,
-            make_replay_buffer(cfg.buffer.capacity, cfg.optim.batch_size),
-            offline_fraction=cfg.offline_fraction,
-            batch_size=cfg.optim.batch_size,
-            keys=TRANSITION_KEYS,
-            seed=cfg.seed,
-        )
-    except ValueError as error:
-        raise RunError(f"dataset={cfg.dataset} cannot be mixed in: {error}") from error
+    fraction, frames = cfg.offline_fraction, cfg.online_frames
+    fits = isinstance(fraction, int | float) and 0 <= fraction <= 1
+    require(fits, cfg, "offline_fraction", "a share from 0 to 1")
+    require(isinstance(frames, int) and frames > 0, cfg, "online_frames", "a positive integer")
+    require(isinstance(cfg.utd, int | float) and cfg.utd > 0, cfg, "utd", "a number above 0")
+    if cfg.optim.total_updates is None:
+        warmup = cfg.collector.init_random_frames
+        cfg.optim.total_updates = updates_due(cfg, warmup + frames)
 
 
 @hydra.main(version_base="1.3", config_path="configs", config_name="o2o_halfcheetah")
 def main(cfg: DictConfig) -> None:
     """Starts or resumes a run; what the user can mend is told in one message."""
     try:
-        if cfg.resume is not None:
+        if cfg.resume is None:
+            train(cfg)
+        else:
             train(*resumed_config(cfg, HydraConfig.get().overrides.task))
-            return
-        train(cfg)
     except (DatasetError, RunError) as error:
         raise SystemExit(f"error: {error}") from None
 

@@ -69,7 +69,7 @@ def train(cfg: DictConfig, checkpoint: dict[str, Any] | None = None) -> Path:
     def evaluation() -> dict[str, float]:
         return evaluate(agent.policy, eval_env, cfg.eval.seed, device)
 
-    with Run(cfg, parts, counters, resumed=checkpoint is not None) as run:
+    with Run(cfg, parts, counters, checkpoint is not None, __file__) as run:
         if counters.frames == 0:
             run.log_evaluation(evaluation())
         for data in collector:  # data has the shape (num_envs, steps)

@@ -26,7 +26,8 @@ DOCS = ROOT / "docs"
 CONFIGS = ROOT / "recipes" / "configs"
 PAGES = [ROOT / "README.md", *(p for p in sorted(DOCS.rglob("*.md")) if "_build" not in p.parts)]
 BLOCK = re.compile(r"(?:<!-- needs: (\S+) -->\n)?^```python(.*)\n((?:.*\n)*?)^```$", re.MULTILINE)
-COMMAND = re.compile(r"python recipes/online_mujoco\.py((?:\\\n|[^\n`#])*)")
+RECIPES = "online_mujoco|o2o_halfcheetah|make_dataset|import_dataset"
+COMMAND = re.compile(rf"python recipes/({RECIPES})\.py((?:\\\n|[^\n`#])*)")
 
 
 def name_of(page: Path) -> str:
@@ -108,20 +109,21 @@ def test_named_tests_exist(page):
 def commands():
     for page in PAGES:
         for match in COMMAND.finditer(page.read_text()):
-            yield page, shlex.split(match.group(1).replace("\\\n", " "))
+            recipe, arguments = match.groups()
+            yield page, recipe, shlex.split(arguments.replace("\\\n", " "))
 
 
 @pytest.mark.parametrize(
-    "arguments", [pytest.param(a, id=f"{name_of(p)}: {' '.join(a)}") for p, a in commands()]
+    ("name", "arguments"),
+    [pytest.param(r, a, id=f"{name_of(p)}: {r} {' '.join(a)}") for p, r, a in commands()],
 )
-def test_commands_compose(arguments):
-    name = "online_mujoco"
+def test_commands_compose(name, arguments):
     if "--config-name" in arguments:
         at = arguments.index("--config-name")
         name = arguments[at + 1]
         del arguments[at : at + 2]
     overrides = [a for a in arguments if "<" not in a and "..." not in a]
-    assert composed(*overrides, name=name).env.name
+    assert composed(*overrides, name=name)
 
 
 # --- names ----------------------------------------------------------------------------------------
@@ -161,6 +163,29 @@ def test_config_page_has_every_key_with_its_default():
         configured = [plain(config[key]) for config in configs if key in config]
         assert all(value in configured for value in values), (key, values, configured)
         assert configured[0] == values[0], (key, values, configured)
+
+
+def documented(section: str) -> dict[str, object]:
+    rows = table_rows("config_offline.md", section)
+    return {key.strip("`"): yaml.safe_load(default.strip("`")) for key, default, *_ in rows}
+
+
+def different(config: DictConfig, base: DictConfig) -> dict[str, object]:
+    usual = flat(base)
+    return {
+        key: plain(value)
+        for key, value in flat(config).items()
+        if key not in usual or value != usual[key]
+    }
+
+
+def test_offline_config_page_has_every_key_with_its_default():
+    o2o = different(composed(name="o2o_halfcheetah"), composed())
+    assert documented("`o2o_halfcheetah.py`") == o2o
+    sac = different(composed(name="dataset_sac"), composed("algo=sac"))
+    assert documented("The SAC run behind `medium` and `medium_replay`") == sac
+    generator = {k: plain(v) for k, v in flat(composed("tier=random", name="make_dataset")).items()}
+    assert documented("`make_dataset.py`") == {**generator, "tier": "???"}
 
 
 def test_config_page_has_both_variants_of_rlpd():

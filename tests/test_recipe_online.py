@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import csv
 import json
-import os
 import re
 import signal
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -16,18 +13,26 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
+from recipe_cases import (
+    CONFIGS,
+    RECIPES,
+    assert_same_state,
+    checkpoint_leaves,
+    composed,
+    rows_of,
+    run,
+    start,
+    without_time,
+)
 
 from torchrl_aca.training.checkpoint import list_checkpoints
 from torchrl_aca.training.config import resumed_config
 from torchrl_aca.training.envs import make_env
 from torchrl_aca.training.errors import RunError
 
-ROOT = Path(__file__).parents[1]
-SCRIPT = ROOT / "recipes" / "online_mujoco.py"
-CONFIGS = ROOT / "recipes" / "configs"
+SCRIPT = RECIPES / "online_mujoco.py"
 TINY_RUN = [
     "env=hopper",
     "num_threads=1",
@@ -61,29 +66,6 @@ TINY_RLPD = [
 ]
 
 
-def start(*arguments: str, cwd: Path) -> subprocess.Popen:
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    return subprocess.Popen(
-        [sys.executable, str(SCRIPT), *arguments],
-        cwd=cwd,
-        env=environment,
-        text=True,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-    )
-
-
-def run(*arguments: str, cwd: Path) -> tuple[int, str, str]:
-    process = start(*arguments, cwd=cwd)
-    output, errors = process.communicate(timeout=120)
-    return process.returncode, output, errors
-
-
-def composed(*overrides: str, name: str = "online_mujoco"):
-    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-        return compose(name, overrides=list(overrides))
-
-
 @pytest.fixture(scope="module")
 def train():
     """The recipe's own `train`, for what needs no process of its own."""
@@ -103,41 +85,6 @@ def unbroken(tmp_path_factory) -> Path:
     (run_dir,) = (cwd / "runs").iterdir()
     (cwd / "output.txt").write_text(output)
     return run_dir
-
-
-def rows_of(path: Path) -> list[dict[str, str]]:
-    with open(path, newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def without_time(path: Path) -> list[dict[str, str]]:
-    return [{k: v for k, v in row.items() if "second" not in k} for row in rows_of(path)]
-
-
-def leaves(value, path=""):
-    if isinstance(value, dict):
-        for key, inner in value.items():
-            yield from leaves(inner, f"{path}/{key}")
-    elif isinstance(value, list | tuple):
-        for index, inner in enumerate(value):
-            yield from leaves(inner, f"{path}/{index}")
-    else:
-        yield path, value
-
-
-def checkpoint_leaves(run_dir: Path) -> dict[str, object]:
-    content = torch.load(list_checkpoints(run_dir / "checkpoints")[-1], weights_only=True)
-    return dict(leaves(content["parts"]))
-
-
-def assert_same_state(first: Path, second: Path) -> None:
-    one, two = checkpoint_leaves(first), checkpoint_leaves(second)
-    assert one.keys() == two.keys()
-    for key in one.keys() - {"/counters/seconds"}:
-        if isinstance(one[key], torch.Tensor):
-            assert torch.equal(one[key], two[key]), key
-        else:
-            assert one[key] == two[key], key
 
 
 def test_run_directory(unbroken):

@@ -23,7 +23,7 @@ from torchrl_aca.training.config import validate
 from torchrl_aca.training.errors import RunError
 from torchrl_aca.training.logging import CsvTable, MetricMeans, ProgressBar
 from torchrl_aca.training.randomness import RandomState, seed_everything
-from torchrl_aca.training.run import StopSignal
+from torchrl_aca.training.run import Run, StopSignal, has_reached
 
 
 def rows_of(path):
@@ -152,6 +152,78 @@ def test_plain_lines_where_there_is_no_terminal(capsys):
     assert capsys.readouterr().out == "updates 5/10  frames 25  loss 0.5\n"
 
 
+def settings(tmp_path, **changes):
+    sections = {
+        "optim": {"total_updates": 100},
+        "collector": {"init_random_frames": 0},
+        "eval": {"interval": 10, "stop_return": None},
+        "checkpoint": {"interval": 20, "keep_last": 9},
+        "logger": {"interval": 5, "backend": "csv"},
+    }
+    for key, value in changes.items():
+        section, name = key.split("__")
+        sections[section][name] = value
+    named = {"algo": {"name": "a"}, "env": {"name": "Toy-v0"}, "seed": 0, "resume": None}
+    return OmegaConf.create({**named, **sections, "run_dir": str(tmp_path / "run")})
+
+
+def iterate(cfg, returns, updates_per_iteration=5):
+    """Ends iterations until a run is over: its updates, and the rows of its two tables."""
+    counters, returns = Counters(frames=1), iter(returns)
+
+    def evaluation():
+        zeros = {"return_std": 0.0, "num_episodes": 1.0, "episode_length": 1.0}
+        return {"return_mean": float(next(returns)), **zeros}
+
+    with Run(cfg, {"counters": counters}, counters, False, "recipe.py") as run:
+        last = False
+        while not last:
+            start = counters.updates
+            counters.updates += updates_per_iteration
+            counters.frames += 1
+            last = run.end_iteration(start, lambda: {"loss": 0.5}, evaluation)
+        run.finish(completed=True)
+    return counters.updates, rows_of(run.dir / "metrics.csv"), rows_of(run.dir / "eval.csv")
+
+
+def test_an_iteration_logs_evaluates_and_saves_what_is_due(tmp_path):
+    cfg = settings(tmp_path, optim__total_updates=45)
+    updates, metrics, evaluations = iterate(cfg, range(10))
+    assert updates == 45
+    assert [row["updates"] for row in metrics] == [str(5 * n) for n in range(1, 10)]
+    # Every tenth update, and the last one.
+    assert [row["updates"] for row in evaluations] == ["10", "20", "30", "40", "45"]
+    saved = [path.stem[-2:] for path in list_checkpoints(tmp_path / "run" / "checkpoints")]
+    assert saved == ["20", "40", "45"]
+
+
+def test_a_run_stops_when_two_evaluations_have_averaged_the_return(tmp_path):
+    cfg = settings(tmp_path, eval__stop_return=50)
+    # 90 alone is luck; (90 + 5) / 2 and (5 + 94) / 2 are too little; (94 + 6) / 2 is enough.
+    updates, _, evaluations = iterate(cfg, [0, 90, 5, 94, 6, 1000])
+    assert updates == 50
+    assert [float(row["return_mean"]) for row in evaluations] == [0, 90, 5, 94, 6]
+
+
+def test_one_evaluation_or_no_return_to_reach_never_stops_a_run():
+    rows = [{"return_mean": "100"}, {"return_mean": "100"}]
+    assert has_reached(rows, 100)
+    assert not has_reached(rows, 100.1)
+    assert not has_reached(rows[:1], 1)
+    assert not has_reached(rows, None)
+
+
+def test_a_stopped_run_names_the_recipe_that_goes_on_with_it(tmp_path, capsys):
+    counters = Counters(updates=3, frames=3)
+    with Run(settings(tmp_path), {"counters": counters}, counters, False, "recipe.py") as run:
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert run.stopping
+        run.log_evaluation({"return_mean": 0.0, "return_std": 0.0, "num_episodes": 1.0})
+        run.finish(completed=False)
+    expected = f"stopped by SIGTERM after 3 updates; go on with: python recipe.py resume={run.dir}"
+    assert expected in capsys.readouterr().out
+
+
 VALID = {
     "algo": {"name": "a"},
     "logger": {"backend": "csv", "interval": 1},
@@ -166,7 +238,7 @@ VALID = {
         "tau": 0.01,
     },
     "seed": 0,
-    "eval": {"interval": 1, "episodes": 3, "seed": 10},
+    "eval": {"interval": 1, "episodes": 3, "seed": 10, "stop_return": None},
     "checkpoint": {"interval": 1, "keep_last": 1},
     "num_threads": None,
     "a": {"num_cells": [8, 8]},
@@ -190,6 +262,7 @@ VALID = {
         ("optim.gamma", 1.5, "at most 1"),
         ("optim.tau", "x", "a number above 0"),
         ("eval.episodes", 0, "a positive integer"),
+        ("eval.stop_return", "high", "a number"),
         ("eval.seed", 4, "apart from the training's 0 to 4"),
         ("seed", -1, "an integer of at least 0"),
         ("num_threads", 0, "a positive integer or null"),

@@ -37,27 +37,27 @@ def validate(cfg: DictConfig, algorithms: Iterable[str]) -> None:
     Raises:
         RunError: Naming the key, what was expected and what was got.
     """
-    _require(cfg.algo.name in algorithms, cfg, "algo.name", f"one of {sorted(algorithms)}")
-    _require(cfg.logger.backend in LOGGERS, cfg, "logger.backend", f"one of {list(LOGGERS)}")
+    require(cfg.algo.name in algorithms, cfg, "algo.name", f"one of {sorted(algorithms)}")
+    require(cfg.logger.backend in LOGGERS, cfg, "logger.backend", f"one of {list(LOGGERS)}")
     precision = f"one of {list(PRECISIONS)}"
-    _require(cfg.matmul_precision in PRECISIONS, cfg, "matmul_precision", precision)
+    require(cfg.matmul_precision in PRECISIONS, cfg, "matmul_precision", precision)
     counts, rates = _counts_and_rates(cfg)
     for key in (*POSITIVE_INTEGERS, *counts):
         value = OmegaConf.select(cfg, key)
-        _require(isinstance(value, int) and value > 0, cfg, key, "a positive integer")
+        require(isinstance(value, int) and value > 0, cfg, key, "a positive integer")
     for key, (low, high) in {**RANGES, **dict.fromkeys(rates, (0, float("inf")))}.items():
         value = OmegaConf.select(cfg, key)
         fits = isinstance(value, int | float) and low < value <= high
-        _require(fits, cfg, key, f"a number above {low}, at most {high}")
+        require(fits, cfg, key, f"a number above {low}, at most {high}")
     stop = cfg.eval.stop_return
-    _require(stop is None or isinstance(stop, int | float), cfg, "eval.stop_return", "a number")
+    require(stop is None or isinstance(stop, int | float), cfg, "eval.stop_return", "a number")
     if cfg.num_threads is not None:
         fits = isinstance(cfg.num_threads, int) and cfg.num_threads > 0
-        _require(fits, cfg, "num_threads", "a positive integer or null")
+        require(fits, cfg, "num_threads", "a positive integer or null")
     for name, section in cfg.items():
         if isinstance(section, DictConfig) and "num_cells" in section:
             fits = all(isinstance(cells, int) and cells > 0 for cells in section.num_cells)
-            _require(fits, cfg, f"{name}.num_cells", "positive integers, one per hidden layer")
+            require(fits, cfg, f"{name}.num_cells", "positive integers, one per hidden layer")
     _validate_sizes(cfg)
     _validate_seeds(cfg)
 
@@ -80,25 +80,25 @@ def _validate_seeds(cfg: DictConfig) -> None:
     for key in ("seed", "eval.seed"):
         value = OmegaConf.select(cfg, key)
         fits = isinstance(value, int) and value >= 0
-        _require(fits, cfg, key, "an integer of at least 0")
+        require(fits, cfg, key, "an integer of at least 0")
     first, last = cfg.seed, cfg.seed + cfg.collector.num_envs - 1
     apart = cfg.eval.seed > last or cfg.eval.seed + cfg.eval.episodes <= first
-    _require(apart, cfg, "eval.seed", f"seeds apart from the training's {first} to {last}")
+    require(apart, cfg, "eval.seed", f"seeds apart from the training's {first} to {last}")
 
 
 def _validate_sizes(cfg: DictConfig) -> None:
     batch, frames = cfg.optim.batch_size, cfg.collector.frames_per_batch
     copies, warmup = cfg.collector.num_envs, cfg.collector.init_random_frames
     fits = "at least optim.batch_size"
-    _require(cfg.buffer.capacity >= batch, cfg, "buffer.capacity", f"{fits} ({batch})")
-    _require(warmup >= batch, cfg, "collector.init_random_frames", f"{fits} ({batch})")
-    _require(
+    require(cfg.buffer.capacity >= batch, cfg, "buffer.capacity", f"{fits} ({batch})")
+    require(warmup >= batch, cfg, "collector.init_random_frames", f"{fits} ({batch})")
+    require(
         frames % copies == 0,
         cfg,
         "collector.frames_per_batch",
         f"a multiple of collector.num_envs ({copies})",
     )
-    _require(
+    require(
         warmup % frames == 0,
         cfg,
         "collector.init_random_frames",
@@ -106,7 +106,8 @@ def _validate_sizes(cfg: DictConfig) -> None:
     )
 
 
-def _require(condition: bool, cfg: DictConfig, key: str, expected: str) -> None:
+def require(condition: bool, cfg: DictConfig, key: str, expected: str) -> None:
+    """Raises `RunError` with the key, what was expected and what was got, unless `condition`."""
     if not condition:
         value = OmegaConf.select(cfg, key)
         raise RunError(f"{key}={value!r}: expected {expected}. Set it with {key}=... .")
@@ -132,12 +133,7 @@ def resumed_config(cfg: DictConfig, overrides: Iterable[str]) -> tuple[DictConfi
     checkpoint = read_checkpoint(run_dir)
     # The checkpoint knows how its networks were built; the file may have been edited since.
     _require_equal(stored, OmegaConf.create(checkpoint["config"]), stored, "config.yaml")
-    typed = {override.split("=")[0].lstrip("+~") for override in overrides} - {"resume"}
-    for key in sorted(typed):
-        part = OmegaConf.create({})
-        OmegaConf.update(part, key, OmegaConf.select(cfg, key))
-        _require_equal(part, stored, part, "the command line")
-        OmegaConf.update(stored, key, OmegaConf.select(cfg, key))
+    apply_overrides(stored, cfg, overrides)
     done = checkpoint["parts"]["counters"]["updates"]
     if done >= stored.optim.total_updates:
         raise RunError(
@@ -146,6 +142,25 @@ def resumed_config(cfg: DictConfig, overrides: Iterable[str]) -> tuple[DictConfi
         )
     stored.resume = str(run_dir)
     return stored, checkpoint
+
+
+def apply_overrides(stored: DictConfig, cfg: DictConfig, overrides: Iterable[str]) -> None:
+    """Brings what the user typed into a run's configuration.
+
+    Args:
+        stored: The run's configuration; changed in place.
+        cfg: The configuration that was composed with the overrides.
+        overrides: What the user typed, such as "optim.total_updates=2000".
+
+    Raises:
+        RunError: If an override would change what the run is.
+    """
+    typed = {override.split("=")[0].lstrip("+~") for override in overrides} - {"resume"}
+    for key in sorted(typed):
+        part = OmegaConf.create({})
+        OmegaConf.update(part, key, OmegaConf.select(cfg, key))
+        _require_equal(part, stored, part, "the command line")
+        OmegaConf.update(stored, key, OmegaConf.select(cfg, key))
 
 
 def _require_equal(

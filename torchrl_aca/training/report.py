@@ -63,6 +63,8 @@ def write_card(
     """Writes card.md: what was run, on what, what came out, and whatever `facts` adds."""
     last = evaluations[-1]
     info = json.loads((run_dir / "versions.json").read_text())
+    score = last.get("normalized_score")
+    scores = {} if score is None else {"normalised score": f"{float(score):.1f}"}
     rows = {
         "environment": config["env"]["name"],
         "algorithm": config["algo"]["name"],
@@ -71,6 +73,7 @@ def write_card(
         "environment frames": f"{last['frames']} (warm-up included)",
         "final return": f"{float(last['return_mean']):.1f} ± {float(last['return_std']):.1f} "
         f"(mean ± std of {float(last['num_episodes']):.0f} episodes)",
+        **scores,
         **facts,
         "wall-clock time": f"{seconds / 60:.1f} min",
         **{name: value for name, value in info.items() if value is not None},

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import signal
-import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
@@ -42,6 +42,12 @@ def make_run_dir(cfg: DictConfig) -> Path:
     return run_dir
 
 
+def has_reached(evaluations: Sequence[Mapping[str, Any]], stop_return: float | None) -> bool:
+    """Tells whether the latest two evaluations have averaged `stop_return`."""
+    latest = [float(row["return_mean"]) for row in evaluations[-2:]]
+    return stop_return is not None and len(latest) == 2 and sum(latest) / 2 >= stop_return
+
+
 class Run:
     """Keeps the books of a training loop; a context manager.
 
@@ -57,6 +63,7 @@ class Run:
         parts: Mapping[str, Stateful],
         counters: Counters,
         resumed: bool,
+        script: str,
         facts: Mapping[str, object] | None = None,
     ) -> None:
         """Opens a new run directory, or the one in `cfg.resume`.
@@ -66,6 +73,7 @@ class Run:
             parts: Everything that a checkpoint holds.
             counters: One of the parts.
             resumed: Whether the parts come from a checkpoint.
+            script: The recipe that can go on with the run.
             facts: More rows for the card.
         """
         self.dir = Path(cfg.resume) if resumed else make_run_dir(cfg)
@@ -73,6 +81,7 @@ class Run:
         self.config = {**OmegaConf.to_container(cfg, resolve=True), "resume": None}
         (self.dir / "config.yaml").write_text(OmegaConf.to_yaml(self.config))
         self.parts, self.counters, self.facts = parts, counters, facts or {}
+        self.script = script
         self._saved: int | None = None  # frames at the latest checkpoint of this sitting
         self.logger = RunLogger(self.dir, self.config, counters.updates if resumed else None)
         self.bar = ProgressBar(cfg.optim.total_updates, counters.updates)
@@ -134,15 +143,11 @@ class Run:
             self.log_metrics(metrics())
         if self.counters.passed(cfg["eval"]["interval"], since) or last:
             self.log_evaluation(evaluation())
-            last = last or self._has_reached(cfg["eval"]["stop_return"])
+            last = last or has_reached(self.logger.tables["eval"].rows, cfg["eval"]["stop_return"])
         if self.counters.passed(cfg["checkpoint"]["interval"], since):
             self.save()
         self.bar.advance(self.counters.updates)
         return last
-
-    def _has_reached(self, stop_return: float | None) -> bool:
-        latest = [float(row["return_mean"]) for row in self.logger.tables["eval"].rows[-2:]]
-        return stop_return is not None and len(latest) == 2 and sum(latest) / 2 >= stop_return
 
     def _speed(self) -> dict[str, float]:
         then, updates, frames = self._lap
@@ -182,7 +187,7 @@ class Run:
         else:
             self.bar.write(
                 f"stopped by {self._signal.received} after {self.counters.updates} updates; "
-                f"go on with: python {sys.argv[0]} resume={self.dir}"
+                f"go on with: python {self.script} resume={self.dir}"
             )
 
 

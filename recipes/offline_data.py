@@ -1,0 +1,132 @@
+"""The offline half of a recipe's minibatches: where it is, whether it fits, what the card says."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import hydra
+import torch
+from make_dataset import make_dataset, task_name
+from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
+from torchrl.envs import EnvBase
+
+from torchrl_aca.offline import MixedReplayBuffer, OfflineDataset
+from torchrl_aca.offline.layout import METADATA_FILE, sha256
+from torchrl_aca.training.data import TRANSITION_KEYS, make_replay_buffer
+from torchrl_aca.training.errors import RunError
+
+
+def dataset_path(cfg: DictConfig) -> Path:
+    """The directory of the data set that `cfg.dataset` names.
+
+    Raises:
+        RunError: If none is named, or one that only TorchRL's own readers know.
+    """
+    if cfg.dataset is None:
+        raise RunError(
+            "dataset=null: expected the directory of a data set, or aca:NAME. Make one with "
+            "recipes/make_dataset.py, or learn without: offline_fraction=0."
+        )
+    prefix, colon, name = cfg.dataset.partition(":")
+    if not colon:
+        return Path(cfg.dataset)
+    if prefix == "aca":  # what `load_dataset("aca:NAME")` of `register_datasets` reads
+        return Path("datasets") / name
+    raise RunError(
+        f"dataset={cfg.dataset}: expected a directory, or aca:NAME for datasets/NAME. Bring other "
+        "data in with recipes/import_dataset.py first. TorchRL's own readers are not used, because "
+        "those of 0.14.1 give wrong rows: zeros for Minari's data, and for D4RL's a next "
+        "observation of zeros at each time limit."
+    )
+
+
+def generate_missing(cfg: DictConfig) -> None:
+    """Makes the data set where there is none and `cfg.generate` says how.
+
+    It draws from the global random streams, so a run is seeded afterwards.
+
+    Raises:
+        DatasetError: See `make_dataset`.
+        RunError: See `make_dataset`; or if `generate` has a key that this does not have.
+    """
+    if cfg.generate is None or not cfg.offline_fraction or dataset_path(cfg).exists():
+        return
+    recipe = hydra.compose("make_dataset", [f"env.name={cfg.env.name}"])
+    try:
+        recipe.merge_with(cfg.generate)
+    except OmegaConfBaseException as error:
+        message = str(error).splitlines()[0]
+        raise RunError(f"generate: {message}; expected keys of make_dataset.yaml.") from None
+    recipe.path = str(dataset_path(cfg))
+    print(f"generating {recipe.path}", flush=True)
+    make_dataset(recipe)
+
+
+def load_offline_data(cfg: DictConfig, env: EnvBase) -> OfflineDataset | None:
+    """The data set, or None where no minibatch has a part of it.
+
+    Raises:
+        DatasetError: If there is none, or it is damaged.
+        RunError: If it was made in another environment than `env`.
+    """
+    if not cfg.offline_fraction:
+        return None
+    dataset = OfflineDataset.load(dataset_path(cfg))
+    require_fit(cfg, dataset.metadata, env)
+    return dataset
+
+
+def require_fit(cfg: DictConfig, metadata: Mapping[str, Any], env: EnvBase) -> None:
+    """Raises `RunError` unless task, sizes and actions of a data set are those of `env`."""
+    actions = env.action_spec_unbatched
+    source, name = metadata["env_id"], f"dataset={cfg.dataset}"
+    if source is not None and task_name(source) != task_name(cfg.env.name):
+        raise RunError(
+            f"{name} is of {source}; expected data of {cfg.env.name}. Choose that environment with "
+            "env=... , or another data set."
+        )
+    got = {key: metadata[f"{key}_dim"] for key in ("observation", "action")}
+    sizes = (env.observation_spec["observation"].shape[-1], actions.shape[-1])
+    if (expected := dict(zip(got, sizes, strict=True))) != got:
+        raise RunError(
+            f"{name} has rows of other sizes than {cfg.env.name}: expected {expected}, got {got}. "
+            "Choose the environment that the data are of with env=... ."
+        )
+    low, high = (torch.tensor(metadata["action_bounds"][side]) for side in ("low", "high"))
+    if (low < actions.space.low).any() or (high > actions.space.high).any():
+        raise RunError(
+            f"{name} has actions between {low.tolist()} and {high.tolist()}; expected them within "
+            f"{actions.space.low.tolist()} and {actions.space.high.tolist()}, which {cfg.env.name} "
+            "takes. Rescale them, or import the data with the environment's action_bounds."
+        )
+
+
+def make_mixture(cfg: DictConfig, dataset: OfflineDataset | None) -> MixedReplayBuffer:
+    """The buffer that minibatches are drawn from. The loss scales the rewards of both halves."""
+    return MixedReplayBuffer(
+        None if dataset is None else dataset.data,
+        make_replay_buffer(cfg.buffer.capacity, cfg.optim.batch_size),
+        offline_fraction=cfg.offline_fraction,
+        batch_size=cfg.optim.batch_size,
+        keys=TRANSITION_KEYS,
+        seed=cfg.seed,
+    )
+
+
+def offline_facts(dataset: OfflineDataset | None, buffer: MixedReplayBuffer) -> dict[str, object]:
+    """Rows for the card: which data, and how much of a minibatch they are."""
+    if dataset is None:
+        return {"offline data": "none"}
+    metadata = dataset.metadata
+    text = f"{metadata['name']}, {metadata['transitions']} transitions"
+    if metadata["returns"]:
+        text += f", mean return {metadata['returns']['mean']:.1f}"
+    return {
+        "offline data": text,
+        f"SHA-256 of its {METADATA_FILE}": sha256(dataset.path / METADATA_FILE),
+        "offline rows of a minibatch": f"{buffer.num_offline(buffer.batch_size)} of "
+        f"{buffer.batch_size}",
+    }

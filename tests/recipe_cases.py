@@ -1,0 +1,79 @@
+"""Recipes, run as users run them, and what their run directories hold."""
+
+from __future__ import annotations
+
+import csv
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
+
+from torchrl_aca.training.checkpoint import list_checkpoints
+
+ROOT = Path(__file__).parents[1]
+RECIPES = ROOT / "recipes"
+CONFIGS = RECIPES / "configs"
+
+
+def start(*arguments: str, cwd: Path, recipe: str = "online_mujoco") -> subprocess.Popen:
+    """A recipe's command, running."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    return subprocess.Popen(
+        [sys.executable, str(RECIPES / f"{recipe}.py"), *arguments],
+        cwd=cwd,
+        env=environment,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+
+
+def run(*arguments: str, cwd: Path, recipe: str = "online_mujoco") -> tuple[int, str, str]:
+    """A recipe's command, run to its end: exit status, output, errors."""
+    process = start(*arguments, cwd=cwd, recipe=recipe)
+    output, errors = process.communicate(timeout=120)
+    return process.returncode, output, errors
+
+
+def composed(*overrides: str, name: str = "online_mujoco") -> DictConfig:
+    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+        return compose(name, overrides=list(overrides))
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def without_time(path: Path) -> list[dict[str, str]]:
+    return [{k: v for k, v in row.items() if "second" not in k} for row in rows_of(path)]
+
+
+def leaves(value, path=""):
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            yield from leaves(inner, f"{path}/{key}")
+    elif isinstance(value, list | tuple):
+        for index, inner in enumerate(value):
+            yield from leaves(inner, f"{path}/{index}")
+    else:
+        yield path, value
+
+
+def checkpoint_leaves(run_dir: Path) -> dict[str, object]:
+    content = torch.load(list_checkpoints(run_dir / "checkpoints")[-1], weights_only=True)
+    return dict(leaves(content["parts"]))
+
+
+def assert_same_state(first: Path, second: Path) -> None:
+    one, two = checkpoint_leaves(first), checkpoint_leaves(second)
+    assert one.keys() == two.keys()
+    for key in one.keys() - {"/counters/seconds"}:
+        if isinstance(one[key], torch.Tensor):
+            assert torch.equal(one[key], two[key]), key
+        else:
+            assert one[key] == two[key], key

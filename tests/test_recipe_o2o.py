@@ -1,0 +1,313 @@
+"""The recipe that mixes offline data in, run as users run it, with tiny sizes."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+from recipe_cases import (
+    CONFIGS,
+    RECIPES,
+    assert_same_state,
+    composed,
+    rows_of,
+    run,
+    without_time,
+)
+
+from torchrl_aca.offline import DatasetError, DatasetWriter
+from torchrl_aca.offline.layout import sha256
+from torchrl_aca.training.config import resumed_config
+from torchrl_aca.training.errors import RunError
+
+SIZES = {"observation_dim": 11, "action_dim": 3}  # Hopper's
+MARK = 1000.0  # below every offline reward, above every online one
+TINY = [
+    "env=hopper",
+    "num_threads=1",
+    "online_frames=60",
+    "collector.init_random_frames=50",
+    "buffer.capacity=300",
+    "optim.batch_size=16",
+    "eval.interval=30",
+    "eval.episodes=2",
+    "checkpoint.interval=25",
+    "logger.interval=10",
+]
+ALGORITHMS = {
+    "aca": [
+        "algo=aca",
+        "aca.num_cells=[16,16]",
+        "aca.num_steps=3",
+        "aca.num_candidates=3",
+        "aca.num_target_candidates=2",
+        "aca.alpha_interval=20",
+    ],
+    "rlpd": ["algo=rlpd", "rlpd.num_cells=[16,16]", "rlpd.num_qvalue_nets=3"],
+}
+
+
+def record(path: Path, env_id: str | None = "Hopper-v4", sizes=SIZES, bound=1.0, seed=0) -> Path:
+    """Three episodes of noise with rewards that no online transition has."""
+    random = np.random.default_rng(seed)
+    with DatasetWriter(path, **sizes, action_bounds=(-bound, bound)) as writer:
+        for _ in range(3):
+            states = random.normal(size=(41, sizes["observation_dim"]))
+            writer.add_episode(
+                states[:-1],
+                random.uniform(-bound, bound, (40, sizes["action_dim"])),
+                states[1:],
+                MARK + random.uniform(1, 2, 40),
+                np.zeros(40, bool),
+                np.arange(40) == 39,
+            )
+        writer.finish(name="noise", env_id=env_id)
+    return path
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    return record(tmp_path_factory.mktemp("data") / "noise")
+
+
+@pytest.fixture(scope="module")
+def recipes():
+    """The recipes' modules, by name."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(RECIPES))
+        yield importlib.import_module
+
+
+@pytest.fixture(scope="module")
+def train(recipes):
+    """The recipe without a process of its own: takes overrides, as the command does."""
+
+    def trainer(*overrides: str, name: str = "o2o_halfcheetah") -> Path:
+        with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+            cfg = compose(name, list(overrides))
+            module = recipes("o2o_halfcheetah")
+            if cfg.resume is None:
+                return module.train(cfg)
+            return module.train(*resumed_config(cfg, overrides))
+
+    return trainer
+
+
+def settings(data: Path, run_dir: Path, algo: str = "aca") -> list[str]:
+    return [*ALGORITHMS[algo], *TINY, f"dataset={data}", f"run_dir={run_dir}"]
+
+
+# --- a run ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_the_command_trains_and_its_card_names_the_data(algo, data, tmp_path):
+    code, output, errors = run(
+        *settings(data, tmp_path / "here", algo), cwd=tmp_path, recipe="o2o_halfcheetah"
+    )
+    assert code == 0, errors
+    assert "mean evaluation return: before" in output
+    metrics = rows_of(tmp_path / "here" / "metrics.csv")
+    assert [int(row["updates"]) for row in metrics] == [10, 20, 30, 40, 50, 60]
+    assert [int(row["frames"]) for row in metrics] == [60, 70, 80, 90, 100, 110]
+    card = (tmp_path / "here" / "card.md").read_text()
+    assert re.search(r"\| offline data \| noise, 120 transitions, mean return 4\d{4}\.\d \|", card)
+    assert sha256(data / "metadata.json") in card
+    assert "| offline rows of a minibatch | 8 of 16 |" in card
+    assert "| updates per online frame | 1 |" in card
+    assert OmegaConf.load(tmp_path / "here" / "config.yaml").optim.total_updates == 60
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_stop_and_resume_equals_never_stopping(algo, data, train, tmp_path):
+    unbroken = train(*settings(data, tmp_path / "unbroken", algo))
+    stopped = train(*settings(data, tmp_path / "here", algo), "optim.total_updates=34")
+    resumed = train(f"resume={stopped}", "optim.total_updates=60")
+    assert_same_state(unbroken, resumed)
+    assert without_time(unbroken / "metrics.csv") == without_time(resumed / "metrics.csv")
+
+
+def test_a_resume_with_other_data_is_refused(data, train, tmp_path):
+    path = shutil.copytree(data, tmp_path / "noise")
+    run_dir = train(*settings(path, tmp_path / "here"), "optim.total_updates=5")
+    shutil.rmtree(path)
+    record(path, seed=1)
+    with pytest.raises(RunError, match="offline fingerprint"):
+        train(f"resume={run_dir}", "optim.total_updates=9")
+    with pytest.raises(RunError, match="offline_fraction=0.2, but the run"):
+        train(f"resume={run_dir}", "offline_fraction=0.2")
+
+
+# --- minibatches ----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def seen(recipes, monkeypatch) -> list[torch.Tensor]:
+    """The rewards of every batch that an agent is given, once a run has been made."""
+    agents, batches = recipes("agents").AGENTS, []
+
+    def watched(make):
+        def make_agent(cfg, env, device):
+            agent = make(cfg, env, device)
+            update = agent.update
+
+            def update_and_note(batch):
+                batches.append(batch["next", "reward"].flatten().clone())
+                return update(batch)
+
+            agent.update = update_and_note
+            return agent
+
+        return make_agent
+
+    for algo in ALGORITHMS:
+        monkeypatch.setitem(agents, algo, watched(agents[algo]))
+    return batches
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+@pytest.mark.parametrize(
+    ("fraction", "offline"), [("0.5", 8), ("0.25", 4), ("0", 0), ("1", 16), ("0.3", 5)]
+)
+def test_every_batch_has_its_share_of_offline_rows(
+    fraction, offline, algo, data, train, seen, tmp_path
+):
+    typed = [f"offline_fraction={fraction}", "optim.total_updates=6"]
+    train(*settings(data, tmp_path / "here", algo), *typed)
+    assert [int((rewards > MARK).sum()) for rewards in seen] == [offline] * 6
+    assert {len(rewards) for rewards in seen} == {16}
+
+
+def test_without_offline_rows_no_data_set_is_needed(train, seen, tmp_path):
+    typed = ["dataset=null", "offline_fraction=0", "optim.total_updates=3"]
+    run_dir = train(*settings(tmp_path, tmp_path / "here"), *typed)
+    assert len(seen) == 3
+    assert "| offline data | none |" in (run_dir / "card.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("algo", "utd", "updates"), [("aca", 2, 40), ("aca", 0.5, 10), ("rlpd", 2, 40)]
+)
+def test_updates_per_frame(algo, utd, updates, data, train, seen, tmp_path):
+    typed = [f"utd={utd}", "online_frames=20", "logger.interval=10"]
+    run_dir = train(*settings(data, tmp_path / "here", algo), *typed)
+    assert len(seen) == updates
+    assert not torch.equal(seen[0], seen[1])  # each update has a batch of its own
+    last = rows_of(run_dir / "metrics.csv")[-1]
+    assert (int(last["updates"]), int(last["frames"])) == (updates, 50 + 20)
+    assert f"| updates per online frame | {utd} |" in (run_dir / "card.md").read_text()
+
+
+# --- where the data are ---------------------------------------------------------------------------
+
+
+def test_a_name_stands_for_a_directory_below_datasets(data, train, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(data, "datasets/noise")
+    by_path = train(*settings(data, tmp_path / "path"), "optim.total_updates=3")
+    typed = ["optim.total_updates=3", "dataset=aca:noise"]
+    assert_same_state(by_path, train(*settings(data, tmp_path / "name"), *typed))
+
+
+def test_missing_data_are_generated_once(train, tmp_path):
+    path = tmp_path / "made"
+    typed = ["generate={tier: random, episodes: 4}", "optim.total_updates=3"]
+    first = train(*settings(path, tmp_path / "first"), *typed)
+    written = (path / "metadata.json").stat().st_mtime_ns
+    second = train(*settings(path, tmp_path / "second"), *typed)
+    assert (path / "metadata.json").stat().st_mtime_ns == written
+    shutil.rmtree(path)
+    third = train(*settings(path, tmp_path / "third"), *typed)
+    assert path.is_dir()
+    assert_same_state(first, second)
+    assert_same_state(first, third)
+    shutil.rmtree(path)
+    train(f"resume={third}", "optim.total_updates=5")
+    assert path.is_dir()
+
+
+def test_the_quickstart_makes_its_data_and_scores_are_normalised(train, tmp_path):
+    tiny = [*ALGORITHMS["aca"], *TINY[1:], "eval.episodes=1", "optim.total_updates=2"]
+    typed = [
+        "env=halfcheetah",
+        f"dataset={tmp_path / 'made'}",
+        "generate.episodes=1",
+        "+generate.check=false",
+    ]
+    run_dir = train(*tiny, *typed, f"run_dir={tmp_path / 'here'}", name="o2o_quickstart")
+    rows = rows_of(run_dir / "eval.csv")
+    for row in rows:  # D4RL's random and expert policies are at 0 and 100
+        expected = 100 * (float(row["return_mean"]) + 280.178953) / (12135 + 280.178953)
+        assert float(row["normalized_score"]) == pytest.approx(expected)
+    score = float(rows[-1]["normalized_score"])
+    assert f"| normalised score | {score:.1f} |" in (run_dir / "card.md").read_text()
+
+
+def test_the_quickstart_differs_from_the_recipe_in_size_alone():
+    quick, usual = composed(name="o2o_quickstart"), composed(name="o2o_halfcheetah")
+    assert quick.algo.name == usual.algo.name == "aca"
+    assert quick.offline_fraction == usual.offline_fraction == 0.5
+    assert quick.generate.tier == "random" and usual.generate is None
+    assert quick.online_frames < usual.online_frames
+
+
+# --- mistakes -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["dataset=null"], "dataset=null: expected the directory.*make_dataset.py"),
+        (["dataset=d4rl:halfcheetah-medium-v2"], "import_dataset.py first.*wrong rows"),
+        (["env=walker2d"], "is of Hopper-v4; expected data of Walker2d-v4"),
+        (["offline_fraction=1.5"], "offline_fraction=1.5: expected a share from 0 to 1"),
+        (["offline_fraction=-0.1"], "offline_fraction=-0.1: expected a share"),
+        (["offline_fraction=half"], "offline_fraction='half': expected a share"),
+        (["utd=0"], "utd=0: expected a number above 0"),
+        (["utd=-1"], "utd=-1: expected a number above 0"),
+        (["utd=fast"], "utd='fast': expected a number above 0"),
+        (["online_frames=0"], "online_frames=0: expected a positive integer"),
+        (["utd=0.01"], "optim.total_updates=0: expected a positive integer"),
+        (["algo=rlpd", "utd=0.5"], "rlpd.actor_interval=0.5: expected a positive integer"),
+        (["dataset=none", "generate={tiers: random}"], "generate: Key 'tiers'.*make_dataset.yaml"),
+        (["dataset=none", "generate={episodes: 5}"], "tier=None: expected one of"),
+        (["dataset=none", "generate={tier: expert}"], "tier=expert: expected one of"),
+    ],
+)
+def test_mistakes_are_told_before_any_work(overrides, message, data, train, tmp_path):
+    typed = [*TINY, f"dataset={data}", f"run_dir={tmp_path / 'here'}", *overrides]
+    with pytest.raises(RunError, match=message):
+        train(*typed)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            {"env_id": None, "sizes": {"observation_dim": 17, "action_dim": 6}},
+            "other sizes.*expected {'observation': 11, 'action': 3}, got {'observation': 17",
+        ),
+        ({"bound": 2.0}, r"actions between \[-2.0.*within \[-1.0"),
+    ],
+)
+def test_data_that_do_not_fit_the_environment_are_refused(options, message, train, tmp_path):
+    path = record(tmp_path / "other", **options)
+    with pytest.raises(RunError, match=message):
+        train(*settings(path, tmp_path / "here"))
+    assert not (tmp_path / "here").exists()
+
+
+def test_a_missing_data_set_is_told_in_one_message(train, tmp_path):
+    with pytest.raises(DatasetError, match="expected the directory of a data set, found nothing"):
+        train(*settings(tmp_path / "nowhere", tmp_path / "here"))
+    typed = settings(tmp_path / "nowhere", tmp_path / "here")
+    code, _, errors = run(*typed, cwd=tmp_path, recipe="o2o_halfcheetah")
+    assert code == 1 and errors.startswith("error: ") and "Traceback" not in errors

@@ -1,0 +1,129 @@
+"""`compile` and `cudagraphs`: what they change on a CPU, which is nothing but the speed."""
+
+from __future__ import annotations
+
+import importlib
+import warnings
+
+import pytest
+import torch
+import torch._inductor.config
+from recipe_cases import RECIPES, composed
+from tensordict import TensorDict
+
+from torchrl_aca.training.acceleration import capture, compiled, make_adam
+from torchrl_aca.training.envs import make_vector_env
+from torchrl_aca.training.errors import RunError
+
+TINY = [
+    "env=inverted_pendulum",
+    "num_threads=1",
+    "aca.num_cells=[16,16]",
+    "aca.num_steps=3",
+    "aca.num_candidates=2",
+    "aca.num_target_candidates=2",
+    "aca.alpha_interval=2",
+]
+
+
+@pytest.fixture(scope="module")
+def recipes():
+    """The recipes' modules, by name."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(RECIPES))
+        yield importlib.import_module
+
+
+def batch_of(seed: int, size: int = 16) -> TensorDict:
+    generator = torch.Generator().manual_seed(seed)
+    terminated = torch.rand(size, 1, generator=generator) < 0.1
+    return TensorDict(
+        observation=torch.randn(size, 4, generator=generator),
+        action=6 * torch.rand(size, 1, generator=generator) - 3,
+        next=TensorDict(
+            observation=torch.randn(size, 4, generator=generator),
+            reward=torch.randn(size, 1, generator=generator),
+            done=terminated,
+            terminated=terminated,
+            batch_size=[size],
+        ),
+        batch_size=[size],
+    )
+
+
+def updated(recipes, *overrides: str, updates: int = 5):
+    """The metrics of a fresh ACA agent's first updates, and its state afterwards."""
+    cfg = composed(*TINY, *overrides)
+    env = make_vector_env(cfg.env.name, 1, 0)
+    torch.manual_seed(0)
+    agent = recipes("agents").AGENTS["aca"](cfg, env, torch.device("cpu"))
+    torch.manual_seed(1)
+    metrics = [agent.update(batch_of(number)).to_dict() for number in range(updates)]
+    return metrics, agent.state["loss"].state_dict()
+
+
+def test_without_the_switches_functions_stay_what_they_are():
+    cfg = composed()
+
+    def step(batch):
+        return batch
+
+    assert capture(step, cfg) is step
+    assert compiled(step, cfg) is step
+
+
+def test_without_cuda_a_captured_step_runs_as_it_is():
+    with pytest.warns(UserWarning, match="(?i)cuda"):
+        step = capture(
+            lambda batch: batch.apply(lambda value: 2 * value), composed("cudagraphs=true")
+        )
+    for number in range(10):  # more than the warm-up
+        batch = TensorDict(value=torch.full((3,), float(number)), batch_size=[3])
+        assert torch.equal(step(batch)["value"], torch.full((3,), 2.0 * number))
+
+
+def test_cudagraphs_on_a_cpu_change_no_update(recipes):
+    plain, plain_state = updated(recipes)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        captured, captured_state = updated(recipes, "cudagraphs=true")
+    assert [sorted(each) for each in plain] == [sorted(each) for each in captured]
+    for one, two in zip(plain, captured, strict=True):
+        assert all(torch.equal(one[name], two[name]) for name in one)
+    for name, value in plain_state.items():
+        assert torch.equal(value, captured_state[name]), name
+
+
+def test_the_recipe_refuses_cudagraphs_on_a_cpu(recipes, tmp_path):
+    cfg = composed(*TINY, "cudagraphs=true", f"run_dir={tmp_path / 'here'}")
+    with pytest.raises(RunError, match="cudagraphs=true: expected device=cuda, got cpu"):
+        recipes("online_mujoco").train(cfg)
+    assert not (tmp_path / "here").exists()
+
+
+@pytest.mark.slow
+def test_compiled_losses_are_those_of_plain_ones(recipes, tmp_path, monkeypatch):
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))
+    plain, _ = updated(recipes, updates=3)
+    # Compiled code has random numbers of its own, unless it is told to draw torch's.
+    with torch._inductor.config.patch(fallback_random=True):
+        quick, _ = updated(recipes, "compile=true", updates=3)
+    for one, two in zip(plain, quick, strict=True):
+        assert one.keys() == two.keys()
+        for name in one:
+            torch.testing.assert_close(two[name], one[name], rtol=1e-4, atol=1e-4)
+
+
+def test_adam_steps_as_the_formula_says():
+    """Two steps of Kingma and Ba's algorithm 1, on one number, in floats of Python."""
+    parameter = torch.nn.Parameter(torch.tensor([1.0]))
+    optimizer = make_adam([parameter], 0.1, composed())
+    value, first, second = 1.0, 0.0, 0.0
+    for step, gradient in enumerate((0.5, -2.0), start=1):
+        parameter.grad = torch.tensor([gradient])
+        optimizer.step()
+        first = 0.9 * first + 0.1 * gradient
+        second = 0.999 * second + 0.001 * gradient**2
+        unbiased = first / (1 - 0.9**step), second / (1 - 0.999**step)
+        value -= 0.1 * unbiased[0] / (unbiased[1] ** 0.5 + 1e-8)
+        assert parameter.item() == pytest.approx(value, rel=1e-5)
