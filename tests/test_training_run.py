@@ -240,6 +240,7 @@ VALID = {
     "seed": 0,
     "eval": {"interval": 1, "episodes": 3, "seed": 10, "stop_return": None},
     "checkpoint": {"interval": 1, "keep_last": 1},
+    "matmul_precision": "highest",
     "num_threads": None,
     "a": {"num_cells": [8, 8]},
 }
