@@ -127,6 +127,27 @@ def test_strides(benchmark, num_inference_steps):
     measure(benchmark, lambda: actor.sample(observation, [BATCH]), BATCH, case, "compiled", work)
 
 
+@pytest.mark.parametrize("precision", ["highest", "medium"])
+@pytest.mark.parametrize("num_candidates", [1, 32])
+def test_precision(benchmark, num_candidates, precision):
+    observation = torch.randn(BATCH, SIZES["HalfCheetah"][0])
+    actor = make_actor("HalfCheetah", "compiled", num_candidates)
+    rows = BATCH * num_candidates
+    case = f"HalfCheetah: target actions, {BATCH} states x {num_candidates}, precision {precision}"
+    torch.set_float32_matmul_precision(precision)
+    try:
+        measure(
+            benchmark,
+            lambda: actor.sample(observation, [BATCH]),
+            rows,
+            case,
+            "compiled",
+            flops(rows, 6),
+        )
+    finally:
+        torch.set_float32_matmul_precision("highest")
+
+
 @pytest.mark.parametrize("tile_rows", [256, 512, 1024, 2048, 8192])
 def test_tiles(benchmark, tile_rows):
     observation = torch.randn(BATCH, SIZES["HalfCheetah"][0])
