@@ -84,6 +84,31 @@ def test_roofline(benchmark, rows):
     measure(benchmark, products, rows, f"matrix product, 2 x {rows} rows", "roofline", work)
 
 
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("size", SIZES)
+def test_denoising_step(benchmark, size, variant):
+    """One guided step of a tile."""
+    observation_dim, action_dim = SIZES[size]
+    observation, level = torch.randn(BATCH, observation_dim), torch.tensor(7)
+    action, noise = torch.randn(2, 4, BATCH, action_dim)
+    if variant == "yardstick":
+        plain = PlainAgent(*SIZES[size], NUM_STEPS)
+        rows = observation.repeat(4, 1)
+
+        def call():
+            plain._step(rows, action.flatten(0, 1), level)
+    else:
+        actor = make_actor(size, variant, 4)
+        features = actor._encode(observation, torch.Size([BATCH]))
+
+        def call():
+            with torch.no_grad():
+                actor._step(features, action, noise, level)
+
+    work = flops(4 * BATCH, action_dim) / (NUM_STEPS - 1)
+    measure(benchmark, call, 4 * BATCH, f"{size}: denoising step, 1024 rows", variant, work)
+
+
 def sampling(benchmark, size: str, num_states: int, num_candidates: int, variant: str, case: str):
     observation = torch.randn(num_states, SIZES[size][0])
     if variant == "yardstick":
