@@ -2,6 +2,7 @@
 # the environment in .venv, caches in .cache.
 
 PYTHON ?= python3
+OUT ?= results/speed.md
 EXTRAS ?= recipes,offline,docs,dev
 SHELL := bash
 .DEFAULT_GOAL := help
@@ -58,9 +59,9 @@ format: $(INSTALLED)  ## repair style and format
 	$(VENV) -m ruff check --fix .
 	$(VENV) -m ruff format .
 
-bench: $(INSTALLED)  ## measure speed and write results/speed.md (THREADS=2)
+bench: $(INSTALLED)  ## measure speed and write results/speed.md (THREADS=2, OUT=another.md)
 	@$(WITH_TMPDIR) $(VENV) -m pytest benchmarks -q --benchmark-only --benchmark-json=$(CACHE)/speed.json $(ARGS)
-	@$(VENV) benchmarks/report.py $(CACHE)/speed.json results/speed.md
+	@$(VENV) benchmarks/report.py $(CACHE)/speed.json $(OUT)
 
 clean:  ## remove caches and builds, keep .venv and outputs
 	rm -rf .cache docs/_build build dist *.egg-info

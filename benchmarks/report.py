@@ -26,10 +26,11 @@ Written by `make bench`. Medians of one run; compare ratios, not times of differ
 
 
 def roofline_of(case: str, products: dict[int, float]) -> float | None:
-    """FLOP/s of the matrix product with the rows of this case; None where it has too few."""
+    """FLOP/s of the matrix product with the rows of this case; None where there is none."""
     if case.endswith("1 states x 1") or case.startswith("iteration"):
         return None
-    return products[next((rows for text, rows in ROOFLINE_ROWS.items() if text in case), 1024)]
+    rows = next((rows for text, rows in ROOFLINE_ROWS.items() if text in case), 1024)
+    return products.get(rows)
 
 
 def table(results: list[dict]) -> str:
@@ -64,7 +65,7 @@ def loop_overhead(results: list[dict]) -> str:
             if r["extra_info"]["case"].startswith("iteration")
             and r["extra_info"]["variant"] == variant
         }
-        if "whole" in seconds:
+        if {"whole", "acting, 5 states x 32", "update"} <= seconds.keys():
             whole = seconds["whole"]
             rest = whole - seconds["acting, 5 states x 32"] - seconds["update"]
             lines.append(

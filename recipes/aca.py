@@ -11,7 +11,7 @@ from torchrl.envs import EnvBase
 from torchrl.objectives import SoftUpdate
 
 from torchrl_aca import ACALoss, CriticGuidedDenoisingActor, NoiseLevelCritic, NoiseSchedule
-from torchrl_aca.training.acceleration import capture, compiled, make_adam
+from torchrl_aca.training.acceleration import capture, compiled, descend, make_adam
 from torchrl_aca.training.agent import Agent
 from torchrl_aca.training.checkpoint import Counters
 
@@ -77,12 +77,6 @@ def make_aca(cfg: DictConfig, env: EnvBase, device: torch.device) -> Agent:
     # The chain compiles its own step, so it is drawn before the compiled loss.
     qvalue_loss = compiled(loss.qvalue_loss, cfg)
     noise_level_loss = compiled(loss.noise_level_loss, cfg)
-
-    def descend(losses: TensorDictBase, name: str, optimizer: torch.optim.Adam) -> TensorDictBase:
-        losses[name].backward()
-        optimizer.step()
-        optimizer.zero_grad()
-        return losses.detach()
 
     @partial(capture, cfg=cfg)
     def td_step(batch: TensorDictBase) -> TensorDictBase:

@@ -11,6 +11,7 @@ import gymnasium as gym
 import hydra
 import numpy as np
 import torch
+from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from online_mujoco import make_agent, make_device, train
 from tensordict import TensorDict
@@ -18,7 +19,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
 from torchrl_aca.training.checkpoint import list_checkpoints, read_checkpoint, restore
-from torchrl_aca.training.config import apply_overrides, resumed_config
+from torchrl_aca.training.config import apply_overrides, require_equal, resumed_config
 from torchrl_aca.training.envs import make_vector_env
 from torchrl_aca.training.errors import RunError
 from torchrl_aca.training.run import has_reached
@@ -118,7 +119,10 @@ def finished_sac_run(cfg: DictConfig, run_dir: Path) -> Path:
         RunError: If the run is another one than the configuration asks for, or was stopped.
     """
     typed = [f"env.name={cfg.env.name}", f"seed={cfg.sac.seed}", *cfg.sac.overrides]
-    wanted = hydra.compose("dataset_sac", [*typed, f"run_dir={run_dir}"])
+    try:
+        wanted = hydra.compose("dataset_sac", [*typed, f"run_dir={run_dir}"])
+    except HydraException as error:
+        raise RunError(f"sac.overrides: {str(error).splitlines()[0]}") from None
     if not (run_dir / "config.yaml").exists():
         train(wanted)
     elif not list_checkpoints(run_dir / "checkpoints"):
@@ -128,6 +132,7 @@ def finished_sac_run(cfg: DictConfig, run_dir: Path) -> Path:
         )
     else:
         stored = OmegaConf.load(run_dir / "config.yaml")
+        require_equal(wanted, stored, wanted, "the SAC run's configuration")
         apply_overrides(stored, wanted, typed)
         if not is_finished(run_dir, stored):
             wanted.resume = str(run_dir)

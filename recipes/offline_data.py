@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_aca.offline import MixedReplayBuffer, OfflineDataset
 from torchrl_aca.offline.layout import METADATA_FILE, sha256
+from torchrl_aca.training.config import require
 from torchrl_aca.training.data import TRANSITION_KEYS, make_replay_buffer
 from torchrl_aca.training.errors import RunError
 
@@ -54,6 +55,8 @@ def generate_missing(cfg: DictConfig) -> None:
     """
     if cfg.generate is None or not cfg.offline_fraction or dataset_path(cfg).exists():
         return
+    fits = isinstance(cfg.generate, DictConfig) and not {"path", "env"} & cfg.generate.keys()
+    require(fits, cfg, "generate", "keys of make_dataset.yaml but path and env")
     recipe = hydra.compose("make_dataset", [f"env.name={cfg.env.name}"])
     try:
         recipe.merge_with(cfg.generate)

@@ -121,6 +121,8 @@ def make_device(cfg: DictConfig) -> torch.device:
     except (RuntimeError, AssertionError) as error:
         message = str(error).splitlines()[0]
         raise RunError(f"device={name}: {message}. Use device=cpu or device=auto.") from error
+    if device.type == "cuda":
+        torch.cuda.set_device(device)
     if cfg.cudagraphs and device.type != "cuda":
         raise RunError(
             f"cudagraphs=true: expected device=cuda, got {device}. Leave it out on a CPU; "

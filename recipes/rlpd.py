@@ -16,7 +16,7 @@ from torchrl.modules import MLP, ProbabilisticActor, ValueOperator
 from torchrl.objectives import SoftUpdate
 
 from torchrl_aca.baselines import EnsembleMLP, EnsembleSACLoss
-from torchrl_aca.training.acceleration import capture, compiled, make_adam
+from torchrl_aca.training.acceleration import capture, compiled, descend, make_adam
 from torchrl_aca.training.agent import Agent
 from torchrl_aca.training.checkpoint import Counters
 
@@ -41,14 +41,6 @@ def make_rlpd(cfg: DictConfig, env: EnvBase, device: torch.device) -> Agent:
     recent, progress = RecentStates(settings.num_actor_batches, device), Counters()
     actor_interval = settings.actor_interval  # not in the update: an interpolation takes its time
     qvalue_loss, actor_loss = compiled(loss.qvalue_loss, cfg), compiled(loss.actor_loss, cfg)
-
-    def descend(
-        losses: TensorDictBase, name: str, optimizer: torch.optim.Optimizer
-    ) -> TensorDictBase:
-        losses[name].backward()
-        optimizer.step()
-        optimizer.zero_grad()
-        return losses.detach()
 
     @partial(capture, cfg=cfg)
     def critic_step(batch: TensorDictBase) -> TensorDictBase:

@@ -100,7 +100,7 @@ def test_a_chain_of_fewer_steps_equals_ddim_on_these_levels(levels, unit, first_
     np.testing.assert_allclose(actor.denoise(observation, noise), expected, rtol=1e-10, atol=1e-10)
 
 
-@pytest.mark.parametrize("steps", [1, T + 1, -2, 2.5])
+@pytest.mark.parametrize("steps", [0, 1, T + 1, -2, 2.5])
 def test_number_of_inference_steps_must_fit_the_levels(steps):
     with pytest.raises(ValueError, match=f"from 2 to {T}, got {steps}"):
         make_actor(num_inference_steps=steps)

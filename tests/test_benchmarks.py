@@ -62,6 +62,9 @@ def test_the_report_divides_by_yardstick_and_roofline():
             result("chain", "compiled", 1024, 200e9, 2.5),  # 80 GFLOP/s
         ]
     )
+    assert "| chain | compiled | 2500.0 ms |  |  |" in table(
+        [result("chain", "compiled", 1024, 200e9, 2.5)]
+    )
     assert "| product | roofline | 1000.0 ms |  | 100 GFLOP/s |" in text
     assert "| chain | yardstick | 8000.0 ms | 1.00 | 25% |" in text
     assert "| chain | compiled | 2500.0 ms | 3.20 | 80% |" in text
@@ -77,4 +80,4 @@ def test_the_report_tells_what_the_loop_costs():
     results = [part("whole", 0.1), part("acting, 5 states x 32", 0.03), part("update", 0.06)]
     assert "(compiled)" in loop_overhead(results)
     assert "takes 10.0 of 100.0 ms, 10%" in loop_overhead(results)
-    assert loop_overhead([part("update", 0.06)]) == ""
+    assert loop_overhead([part("update", 0.06), part("whole", 0.1)]) == ""

@@ -182,6 +182,14 @@ def test_a_finished_run_is_used_again_and_one_of_another_seed_is_refused(generat
     assert again.metadata["sha256"] == OfflineDataset.load(folder / "medium").metadata["sha256"]
     with pytest.raises(RunError, match="seed=7, but the run to resume has seed=100"):
         generate("medium", folder, f"path={folder / 'other'}", "sac.seed=7")
+    fewer = [override for override in SAC if not override.startswith("sac.num_cells")]
+    with pytest.raises(RunError, match="num_cells=.*but the run to resume has"):
+        generate("medium", folder, f"path={folder / 'other'}", sac=fewer)
+
+
+def test_a_mistyped_override_of_the_run_is_told_in_one_message(generate, tmp_path):
+    with pytest.raises(RunError, match="^sac.overrides: .*optim.update"):
+        generate("medium", tmp_path, sac=[*SAC, "optim.updates=5"])
 
 
 def test_the_run_stops_when_two_evaluations_have_averaged_the_return(generate, tmp_path):

@@ -131,6 +131,21 @@ def test_what_a_killed_writer_left_does_not_load_and_is_replaced(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_of_two_writers_with_one_path_the_second_one_finishes(tmp_path):
+    first, second = (DatasetWriter(tmp_path / "data", OBSERVATION_DIM, ACTION_DIM) for _ in "12")
+    with second:
+        with pytest.raises(DatasetError, match="another one has begun to write"), first:
+            second.__enter__()  # as if it began while the first one is at work
+            first.add_episode(**EPISODES[0])
+            first.finish(name="first")
+        for episode in EPISODES:
+            second.add_episode(**episode)
+        dataset = second.finish(name="second")
+    assert dataset.metadata["name"] == "second" and len(dataset.data) == SIZE
+    assert list(tmp_path.iterdir()) == [dataset.path]
+    assert not (dataset.path / "owner").exists()
+
+
 def test_forgetting_finish_is_an_error(tmp_path):
     with (
         pytest.raises(DatasetError, match="finish"),

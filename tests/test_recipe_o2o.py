@@ -250,10 +250,10 @@ def test_the_quickstart_makes_its_data_and_scores_are_normalised(train, tmp_path
     assert f"| normalised score | {score:.1f} |" in (run_dir / "card.md").read_text()
 
 
-def test_the_quickstart_differs_from_the_recipe_in_size_alone():
+def test_the_quickstart_makes_its_data_and_is_short():
     quick, usual = composed(name="o2o_quickstart"), composed(name="o2o_halfcheetah")
     assert quick.algo.name == usual.algo.name == "aca"
-    assert quick.offline_fraction == usual.offline_fraction == 0.5
+    assert 0 < quick.offline_fraction <= usual.offline_fraction == 0.5
     assert quick.generate.tier == "random" and usual.generate is None
     assert quick.online_frames < usual.online_frames
 
@@ -277,6 +277,8 @@ def test_the_quickstart_differs_from_the_recipe_in_size_alone():
         (["utd=0.01"], "optim.total_updates=0: expected a positive integer"),
         (["algo=rlpd", "utd=0.5"], "rlpd.actor_interval=0.5: expected a positive integer"),
         (["dataset=none", "generate={tiers: random}"], "generate: Key 'tiers'.*make_dataset.yaml"),
+        (["dataset=none", "generate=random"], "generate='random': expected keys of make_dataset"),
+        (["dataset=none", "generate={tier: random, path: x}"], "expected keys.*but path and env"),
         (["dataset=none", "generate={episodes: 5}"], "tier=None: expected one of"),
         (["dataset=none", "generate={tier: expert}"], "tier=expert: expected one of"),
     ],

@@ -34,6 +34,9 @@ def recipes():
         yield importlib.import_module
 
 
+without_cuda = pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU captures these steps")
+
+
 def batch_of(seed: int, size: int = 16) -> TensorDict:
     generator = torch.Generator().manual_seed(seed)
     terminated = torch.rand(size, 1, generator=generator) < 0.1
@@ -72,6 +75,7 @@ def test_without_the_switches_functions_stay_what_they_are():
     assert compiled(step, cfg) is step
 
 
+@without_cuda
 def test_without_cuda_a_captured_step_runs_as_it_is():
     with pytest.warns(UserWarning, match="(?i)cuda"):
         step = capture(
@@ -82,6 +86,7 @@ def test_without_cuda_a_captured_step_runs_as_it_is():
         assert torch.equal(step(batch)["value"], torch.full((3,), 2.0 * number))
 
 
+@without_cuda
 def test_cudagraphs_on_a_cpu_change_no_update(recipes):
     plain, plain_state = updated(recipes)
     with warnings.catch_warnings():

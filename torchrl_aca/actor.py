@@ -36,7 +36,7 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
     uses one fixed set of draws, the same for every state: the action is then a function of the
     observation and the weights alone. Best of N stays.
 
-    With ``sampler="langevin"`` the same chains take ``T`` Langevin steps along the gradient of the
+    With ``sampler="langevin"`` the same chains take ``S`` Langevin steps along the gradient of the
     critic at level 0 instead (Langevin-Q of the paper's appendix). Any critic with a level 0 will
     do, one that ignores the noise level as well.
 
@@ -129,7 +129,9 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         anchor = first_parameter(self.critic)
         # A copy: `to` works in place, and the schedule may serve actors on other devices too.
         self.schedule = copy.deepcopy(schedule).to(anchor.device)
-        self.num_inference_steps = num_inference_steps or schedule.num_steps
+        if num_inference_steps is None:
+            num_inference_steps = schedule.num_steps
+        self.num_inference_steps = num_inference_steps
         self.chain_schedule = self.schedule.strided(self.num_inference_steps)
         self.guidance_weight = guidance_weight
         self.num_candidates = num_candidates

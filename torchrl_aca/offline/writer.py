@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import uuid
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -73,6 +74,7 @@ class DatasetWriter:
         self.returns: list[float] = []
         self.lengths: list[int] = []
         self.cut: list[int] = []
+        self._owner, self._token = self.staging / "owner", uuid.uuid4().hex
         self._files: dict[NestedKey, Any] = {}
         self._open = ExitStack()
 
@@ -80,6 +82,7 @@ class DatasetWriter:
         if self.staging.is_dir():  # left by a writer that was killed
             shutil.rmtree(self.staging)
         (self.staging / "next").mkdir(parents=True)
+        self._owner.write_text(self._token)
         for key in self.layout:
             file = open(self.staging / file_name(key), "wb")  # noqa: SIM115
             self._files[key] = self._open.enter_context(file)
@@ -92,7 +95,7 @@ class DatasetWriter:
         traceback: TracebackType | None,
     ) -> None:
         self._open.close()
-        if self.staging.is_dir():
+        if self._owns_staging():
             shutil.rmtree(self.staging)
             if kind is None:
                 raise DatasetError(
@@ -168,8 +171,10 @@ class DatasetWriter:
             The data set, loaded from its path.
 
         Raises:
-            DatasetError: If the data fail a check; nothing is at the path then.
+            DatasetError: If the data fail a check, or another writer has begun with the same path;
+                nothing is at the path then.
         """
+        self._require_staging()
         scores, checked = _reference_scores(reference_scores), self.checks.finish()
         self._sync()
         low, high = (bound.tolist() for bound in self.bounds)
@@ -195,8 +200,21 @@ class DatasetWriter:
         text = json.dumps(metadata, indent=2, default=str)
         (self.staging / METADATA_FILE).write_text(text + "\n")
         OfflineDataset.load(self.staging)
+        self._require_staging()
+        self._owner.unlink()
         os.rename(self.staging, self.path)
         return OfflineDataset.load(self.path)
+
+    def _owns_staging(self) -> bool:
+        """Whether the staging directory is still the one that this writer has made."""
+        return self._owner.is_file() and self._owner.read_text() == self._token
+
+    def _require_staging(self) -> None:
+        if not self._owns_staging():
+            raise DatasetError(
+                f"{self.staging} is no longer this writer's: another one has begun to write "
+                f"{self.path}. Let one of them finish, or give them different paths."
+            )
 
     def _rows(self, given: Mapping[NestedKey, Any]) -> dict[NestedKey, torch.Tensor]:
         """Returns one episode in canonical form: for each key L rows."""

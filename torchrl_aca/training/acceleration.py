@@ -39,5 +39,21 @@ def make_adam(
     parameters = list(parameters)
     if cfg.cudagraphs and parameters[0].is_cuda:
         rate = torch.tensor(lr, device=parameters[0].device)
-        return torch.optim.Adam(parameters, lr=rate, fused=True, capturable=True)
+        adam = torch.optim.Adam(parameters, lr=rate, fused=True, capturable=True)
+        adam.register_load_state_dict_post_hook(_rates_to_device)
+        return adam
     return torch.optim.Adam(parameters, lr=lr, fused=True)
+
+
+def _rates_to_device(optimizer: torch.optim.Optimizer) -> None:
+    """A checkpoint holds the rates on the CPU, from where a graph would take them as constants."""
+    for group in optimizer.param_groups:
+        group["lr"] = group["lr"].to(group["params"][0].device)
+
+
+def descend(losses: TensorDictBase, name: str, optimizer: torch.optim.Optimizer) -> TensorDictBase:
+    """Takes a step of `optimizer` down `losses[name]` and returns the losses, detached."""
+    losses[name].backward()
+    optimizer.step()
+    optimizer.zero_grad()
+    return losses.detach()

@@ -25,7 +25,14 @@ RANGES = {
     "optim.gamma": (0, 1),
     "optim.tau": (0, 1),
 }
-MAY_CHANGE_ON_RESUME = ("optim.total_updates", "num_threads", "logger", "checkpoint", "video")
+MAY_CHANGE_ON_RESUME = (
+    "optim.total_updates",
+    "num_threads",
+    "logger",
+    "checkpoint",
+    "video",
+    "eval.stop_return",
+)
 NOT_COMPARED = (*MAY_CHANGE_ON_RESUME, "resume", "run_dir")
 PRECISIONS = ("highest", "high", "medium")
 LOGGERS = ("csv", "wandb", "tensorboard", "none")
@@ -132,7 +139,7 @@ def resumed_config(cfg: DictConfig, overrides: Iterable[str]) -> tuple[DictConfi
     stored = OmegaConf.load(run_dir / "config.yaml")
     checkpoint = read_checkpoint(run_dir)
     # The checkpoint knows how its networks were built; the file may have been edited since.
-    _require_equal(stored, OmegaConf.create(checkpoint["config"]), stored, "config.yaml")
+    require_equal(stored, OmegaConf.create(checkpoint["config"]), stored, "config.yaml")
     apply_overrides(stored, cfg, overrides)
     done = checkpoint["parts"]["counters"]["updates"]
     if done >= stored.optim.total_updates:
@@ -159,20 +166,25 @@ def apply_overrides(stored: DictConfig, cfg: DictConfig, overrides: Iterable[str
     for key in sorted(typed):
         part = OmegaConf.create({})
         OmegaConf.update(part, key, OmegaConf.select(cfg, key))
-        _require_equal(part, stored, part, "the command line")
+        require_equal(part, stored, part, "the command line")
         OmegaConf.update(stored, key, OmegaConf.select(cfg, key))
 
 
-def _require_equal(
+def require_equal(
     new: DictConfig, run: DictConfig, keys: DictConfig, where: str, prefix: str = ""
 ) -> None:
+    """Compares the entries of `keys` in two configurations, but for those that may change.
+
+    Raises:
+        RunError: Naming the first key that `run` has otherwise than `new`, which is from `where`.
+    """
     for name in keys:
         key = f"{prefix}{name}"
         if any(key == free or key.startswith(f"{free}.") for free in NOT_COMPARED):
             continue
         value = OmegaConf.select(new, key)
         if isinstance(value, DictConfig):
-            _require_equal(new, run, value, where, f"{key}.")
+            require_equal(new, run, value, where, f"{key}.")
         elif value != OmegaConf.select(run, key):
             raise RunError(
                 f"{where} has {key}={value}, but the run to resume has "
