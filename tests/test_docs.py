@@ -186,6 +186,10 @@ def test_offline_config_page_has_every_key_with_its_default():
     assert documented("The SAC run behind `medium` and `medium_replay`") == sac
     generator = {k: plain(v) for k, v in flat(composed("tier=random", name="make_dataset")).items()}
     assert documented("`make_dataset.py`") == {**generator, "tier": "???"}
+    required = ["source=x", "format=d4rl", "path=y"]
+    importer = {k: plain(v) for k, v in flat(composed(*required, name="import_dataset")).items()}
+    unset = dict.fromkeys(("source", "format", "path"), "???")
+    assert documented("`import_dataset.py`") == {**importer, **unset}
 
 
 def test_config_page_has_both_variants_of_rlpd():
