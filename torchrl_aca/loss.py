@@ -12,17 +12,18 @@ from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torchrl.objectives import LossModule, ValueEstimators
-from torchrl.objectives.utils import dispatch_value_estimator, distance_loss
+from torchrl.objectives import ValueEstimators
+from torchrl.objectives.utils import distance_loss
 
 from torchrl_aca import functional as F
 from torchrl_aca.actor import CriticGuidedDenoisingActor
 from torchrl_aca.critic import NoiseLevelCriticBase
+from torchrl_aca.td_loss import TDLoss, next_key
 
 __all__ = ["ACALoss"]
 
 
-class ACALoss(LossModule):
+class ACALoss(TDLoss):
     """Loss module of *Actor-Critic without Actor* (arXiv 2509.21022).
 
     Three losses, each to be had alone as a TensorDict of its ``loss_*`` entry and metrics:
@@ -110,7 +111,15 @@ class ACALoss(LossModule):
 
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
-    default_value_estimator = ValueEstimators.TD0
+    loss_names = ("loss_qvalue", "loss_noise_level", "loss_alpha")
+    metric_names = (
+        "pred_value",
+        "target_value",
+        "noisy_value",
+        "alpha",
+        "entropy",
+        "exploration_std",
+    )
     SUPPORTED_VALUE_ESTIMATORS = (
         ValueEstimators.TD0,
         ValueEstimators.TD1,
@@ -139,8 +148,6 @@ class ACALoss(LossModule):
         reduction: Literal["none", "mean", "sum"] | None = None,
         use_prioritized_weights: bool | Literal["auto"] = "auto",
     ) -> None:
-        self._in_keys: list[NestedKey] | None = None
-        self._out_keys: list[str] | None = None
         super().__init__()
         critic = actor_network.critic
         if qvalue_network not in (None, critic, getattr(critic, "module", None)):
@@ -186,7 +193,8 @@ class ACALoss(LossModule):
         td_error = (value.detach() - target).abs().amax(-1)
         tensordict.set(self.tensor_keys.priority, td_error)
         metrics = {"pred_value": value.detach().mean(), "target_value": target.mean()}
-        return self._output("loss_qvalue", error, tensordict, metrics)
+        weights = self._maybe_get_priority_weight(tensordict)
+        return self._output("loss_qvalue", error, tensordict, metrics, weights)
 
     def noise_level_loss(self, tensordict: TensorDictBase) -> TensorDict:
         """Regression of ``Q(s, a_t, t)`` on ``Q(s, a_0, 0)``."""
@@ -205,7 +213,8 @@ class ACALoss(LossModule):
         target = F.noise_level_target(clean_value, self.noise_level_target)
         error = distance_loss(value, target, self.loss_function).sum(-1)
         metrics = {"noisy_value": value.detach().mean()}
-        return self._output("loss_noise_level", error, tensordict, metrics)
+        weights = self._maybe_get_priority_weight(tensordict)
+        return self._output("loss_noise_level", error, tensordict, metrics, weights)
 
     def alpha_loss(self, tensordict: TensorDictBase | None = None) -> TensorDict:
         """Open-loop schedule of the exploration noise; depends on no data.
@@ -271,7 +280,7 @@ class ACALoss(LossModule):
         :meth:`qvalue_loss` does so by itself where the input has no ``next_action``. Drawn
         beforehand, it lets the rest of the loss be compiled without the chain.
         """
-        observation = [tensordict[_next(key)] for key in self.actor_network.in_keys]
+        observation = [tensordict[next_key(key)] for key in self.actor_network.in_keys]
         batch = tensordict[self.tensor_keys.action].shape[:-1]
         return self.actor_network.sample(
             observation, batch, num_candidates=self.num_target_candidates
@@ -281,7 +290,7 @@ class ACALoss(LossModule):
     def _target_value(self, tensordict: TensorDictBase) -> Tensor:
         """TD target ``y`` of shape ``(*batch, 1)``, made by the value estimator."""
         actor, keys = self.actor_network, self.tensor_keys
-        observation = [tensordict[_next(key)] for key in actor.in_keys]
+        observation = [tensordict[next_key(key)] for key in actor.in_keys]
         next_action = tensordict.get(keys.next_action, None)
         if next_action is None:
             next_action = self.sample_next_action(tensordict)
@@ -292,13 +301,10 @@ class ACALoss(LossModule):
             params=self.target_qvalue_network_params,
         )
         next_value = next_values.amin(-1, keepdim=True)
-        # A terminal state may hold anything, NaN included: its value is zero, not zero times that.
-        terminated = tensordict[_next(keys.terminated)]
-        next_value = next_value.masked_fill(terminated.reshape(next_value.shape), 0.0)
         data = tensordict.clone(recurse=False)
-        data.set(_next(keys.reward), self.reward_scale * data[_next(keys.reward)])
-        data.set(_next(self.value_estimator.tensor_keys.value), next_value)
-        return self.value_estimator.value_estimate(data).reshape(next_value.shape)
+        reward = next_key(keys.reward)
+        data.set(reward, self.reward_scale * data[reward])
+        return self._td_target(data, next_value)
 
     def _state_and_action(self, tensordict: TensorDictBase) -> tuple[list[Tensor], Tensor]:
         """Observations as they are, and the action in critic units."""
@@ -310,78 +316,16 @@ class ACALoss(LossModule):
     def _clean_level(action: Tensor) -> Tensor:
         return torch.zeros(action.shape[:-1], dtype=torch.long, device=action.device)
 
-    def _output(
-        self, name: str, error: Tensor, tensordict: TensorDictBase, metrics: dict[str, Tensor]
-    ) -> TensorDict:
-        weights = self._maybe_get_priority_weight(tensordict)
-        loss = self._reduce_loss(error, tensordict, weights=weights)
-        if self.reduction == "none":
-            return TensorDict({name: loss}, batch_size=tensordict.batch_size)
-        return TensorDict({name: loss, **metrics})
-
     # --- the LossModule contract ------------------------------------------------------------------
 
-    def make_value_estimator(
-        self, value_type: ValueEstimators | None = None, **hyperparams: Any
-    ) -> Any:
-        """Set the value estimator: TD0 (default), TD1 or TD(lambda); see ``LossModule``."""
-        value_type, hyperparams = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
-        if value_type is not None:
-            dispatch_value_estimator(
-                self,
-                value_type,
-                supported=self.SUPPORTED_VALUE_ESTIMATORS,
-                tensor_keys={"value_target": "value_target", **self._estimator_keys()},
-                value_network=None,
-                **hyperparams,
-            )
-        return self
-
-    def _estimator_keys(self) -> dict[str, NestedKey]:
-        names = ("value", "reward", "done", "terminated")
-        return {name: getattr(self.tensor_keys, name) for name in names}
-
-    def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
-        if self._value_estimator is not None:
-            self._value_estimator.set_keys(**self._estimator_keys())
-        self._in_keys = None
+    def _state_keys(self) -> list[NestedKey]:
+        return self.actor_network.in_keys
 
     def _maybe_get_priority_weight(self, tensordict: TensorDictBase) -> Tensor | None:
         """As the parent's, whose test for the key fails on nested keys."""
         if self.use_prioritized_weights not in (True, "auto"):
             return None
         return tensordict.get(self.tensor_keys.priority_weight, None)
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """Keys that the loss reads; random draws are optional and not listed."""
-        if self._in_keys is None:
-            keys, observation_keys = self.tensor_keys, self.actor_network.in_keys
-            self._in_keys = [
-                keys.action,
-                *observation_keys,
-                *(_next(key) for key in (keys.reward, keys.done, keys.terminated)),
-                *(_next(key) for key in observation_keys),
-            ]
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, values: list[NestedKey]) -> None:
-        self._in_keys = values
-
-    @property
-    def out_keys(self) -> list[str]:
-        """The losses, then the metrics."""
-        if self._out_keys is None:
-            losses = ["loss_qvalue", "loss_noise_level", "loss_alpha"]
-            metrics = ["pred_value", "target_value", "noisy_value"]
-            metrics += ["alpha", "entropy", "exploration_std"]
-            self._out_keys = losses if self.reduction == "none" else losses + metrics
-        return self._out_keys
-
-    @out_keys.setter
-    def out_keys(self, values: list[str]) -> None:
-        self._out_keys = values
 
     def __deepcopy__(self, memo: dict[int, Any]) -> ACALoss:
         """A copy whose actor holds the copy's parameters; TensorDict's own copy would part them."""
@@ -396,7 +340,3 @@ class ACALoss(LossModule):
         super()._apply(fn)
         self.actor_network._apply(fn)
         return self
-
-
-def _next(key: NestedKey) -> NestedKey:
-    return ("next", key) if isinstance(key, str) else ("next", *key)

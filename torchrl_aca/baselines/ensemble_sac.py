@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
@@ -15,8 +15,8 @@ from torch import Tensor, nn
 from torchrl.data import Bounded, Composite, TensorSpec
 from torchrl.modules import ProbabilisticActor
 from torchrl.modules.distributions.utils import rsample_and_log_prob
-from torchrl.objectives import LossModule, ValueEstimators
-from torchrl.objectives.utils import dispatch_value_estimator
+
+from torchrl_aca.td_loss import TDLoss, next_key
 
 __all__ = ["EnsembleSACLoss"]
 
@@ -27,7 +27,7 @@ TEMPERATURES: dict[str, tuple[Callable[[Tensor], Tensor], Callable[[float], floa
 }
 
 
-class EnsembleSACLoss(LossModule):
+class EnsembleSACLoss(TDLoss):
     """Loss module of RLPD (*Efficient Online RL with Offline Data*, arXiv 2302.02948).
 
     With critics ``Q_1..Q_E``, their targets ``Q_bar_i``, a random subset ``M`` of the members for
@@ -125,8 +125,8 @@ class EnsembleSACLoss(LossModule):
 
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
-    default_value_estimator = ValueEstimators.TD0
-    SUPPORTED_VALUE_ESTIMATORS = (ValueEstimators.TD0,)
+    loss_names = ("loss_qvalue", "loss_actor", "loss_alpha")
+    metric_names = ("pred_value", "target_value", "entropy", "alpha")
 
     actor_network: ProbabilisticActor
     qvalue_network: TensorDictModule
@@ -149,8 +149,6 @@ class EnsembleSACLoss(LossModule):
         temperature: Literal["exp", "softplus"] = "exp",
         reduction: Literal["none", "mean", "sum"] | None = None,
     ) -> None:
-        self._in_keys: list[NestedKey] | None = None
-        self._out_keys: list[str] | None = None
         super().__init__()
         self.num_qvalue_nets = _stack_size(qvalue_network)
         _check_choice("actor_value", actor_value, ("mean", "min"))
@@ -290,79 +288,12 @@ class EnsembleSACLoss(LossModule):
         next_value = next_values.amin(-1, keepdim=True)
         if self.entropy_backup:
             next_value = next_value - self.alpha * log_prob.unsqueeze(-1)
-        # A terminal state may hold anything, NaN included: its value is zero, not zero times that.
-        terminated = tensordict[_next(keys.terminated)]
-        next_value = next_value.masked_fill(terminated.reshape(next_value.shape), 0.0)
-        data = tensordict.select(*map(_next, (keys.reward, keys.done, keys.terminated)))
-        data.set(_next(self.value_estimator.tensor_keys.value), next_value)
-        return self.value_estimator.value_estimate(data).reshape(next_value.shape)
+        data = tensordict.select(*map(next_key, (keys.reward, keys.done, keys.terminated)))
+        return self._td_target(data, next_value)
 
-    def _output(
-        self, name: str, error: Tensor, tensordict: TensorDictBase, metrics: dict[str, Tensor]
-    ) -> TensorDict:
-        loss = self._reduce_loss(error, tensordict)
-        if self.reduction == "none":
-            return TensorDict({name: loss}, batch_size=tensordict.batch_size)
-        return TensorDict({name: loss, **metrics})
-
-    # --- the LossModule contract ------------------------------------------------------------------
-
-    def make_value_estimator(
-        self, value_type: ValueEstimators | None = None, **hyperparams: Any
-    ) -> Any:
-        """Set the value estimator, which can only be TD0; see ``LossModule``."""
-        value_type, hyperparams = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
-        if value_type is not None:
-            dispatch_value_estimator(
-                self,
-                value_type,
-                supported=self.SUPPORTED_VALUE_ESTIMATORS,
-                tensor_keys={"value_target": "value_target", **self._estimator_keys()},
-                value_network=None,
-                **hyperparams,
-            )
-        return self
-
-    def _estimator_keys(self) -> dict[str, NestedKey]:
-        names = ("value", "reward", "done", "terminated")
-        return {name: getattr(self.tensor_keys, name) for name in names}
-
-    def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
-        if self._value_estimator is not None:
-            self._value_estimator.set_keys(**self._estimator_keys())
-        self._in_keys = None
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """Keys that the loss reads."""
-        if self._in_keys is None:
-            keys = self.tensor_keys
-            networks = [*self.actor_network.in_keys, *self.qvalue_network.in_keys]
-            states = [key for key in dict.fromkeys(networks) if key != self._policy_action_key]
-            self._in_keys = [
-                keys.action,
-                *states,
-                *(_next(key) for key in (keys.reward, keys.done, keys.terminated)),
-                *(_next(key) for key in states),
-            ]
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, values: list[NestedKey]) -> None:
-        self._in_keys = values
-
-    @property
-    def out_keys(self) -> list[str]:
-        """The losses, then the metrics."""
-        if self._out_keys is None:
-            losses = ["loss_qvalue", "loss_actor", "loss_alpha"]
-            metrics = ["pred_value", "target_value", "entropy", "alpha"]
-            self._out_keys = losses if self.reduction == "none" else losses + metrics
-        return self._out_keys
-
-    @out_keys.setter
-    def out_keys(self, values: list[str]) -> None:
-        self._out_keys = values
+    def _state_keys(self) -> list[NestedKey]:
+        networks = [*self.actor_network.in_keys, *self.qvalue_network.in_keys]
+        return [key for key in dict.fromkeys(networks) if key != self._policy_action_key]
 
 
 def _stack_size(network: nn.Module) -> int:
@@ -380,7 +311,3 @@ def _stack_size(network: nn.Module) -> int:
 def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
     if value not in choices:
         raise ValueError(f"{name} must be one of {choices}, got {value!r}.")
-
-
-def _next(key: NestedKey) -> NestedKey:
-    return ("next", key) if isinstance(key, str) else ("next", *key)

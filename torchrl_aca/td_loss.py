@@ -1,0 +1,124 @@
+"""What losses with a TD target share: the contract of a LossModule, and the target itself."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Any
+
+from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.objectives import LossModule, ValueEstimators
+from torchrl.objectives.utils import dispatch_value_estimator
+
+__all__ = ["TDLoss", "next_key"]
+
+
+class TDLoss(LossModule):
+    """Base class of losses that regress critics on ``r + gamma (1 - terminated) V(s')``.
+
+    A subclass has ``_AcceptedKeys`` with ``action``, ``value``, ``reward``, ``done`` and
+    ``terminated``, its losses, and what is declared here.
+
+    Attributes:
+        loss_names: keys of the losses in the output.
+        metric_names: keys of the metrics in the output, which ``reduction="none"`` leaves out.
+    """
+
+    tensor_keys: Any
+    reduction: str
+    loss_names: tuple[str, ...]
+    metric_names: tuple[str, ...]
+    default_value_estimator = ValueEstimators.TD0
+    SUPPORTED_VALUE_ESTIMATORS: tuple[ValueEstimators, ...] = (ValueEstimators.TD0,)
+
+    def __init__(self) -> None:
+        self._in_keys: list[NestedKey] | None = None
+        self._out_keys: list[str] | None = None
+        super().__init__()
+
+    @abstractmethod
+    def _state_keys(self) -> list[NestedKey]:
+        """Keys of what the networks see of a state."""
+
+    def _td_target(self, data: TensorDictBase, next_value: Tensor) -> Tensor:
+        """The target ``y`` of shape ``(*batch, 1)``, made by the value estimator.
+
+        Args:
+            data: rewards and flags below ``"next"``; the next value is written to it.
+            next_value: ``V(s')``, shape ``(*batch, 1)``.
+        """
+        # A terminal state may hold anything, NaN included: its value is zero, not zero times that.
+        terminated = data[next_key(self.tensor_keys.terminated)]
+        next_value = next_value.masked_fill(terminated.reshape(next_value.shape), 0.0)
+        data.set(next_key(self.value_estimator.tensor_keys.value), next_value)
+        return self.value_estimator.value_estimate(data).reshape(next_value.shape)
+
+    def _output(
+        self,
+        name: str,
+        error: Tensor,
+        tensordict: TensorDictBase,
+        metrics: dict[str, Tensor],
+        weights: Tensor | None = None,
+    ) -> TensorDict:
+        """One loss, reduced from errors of shape ``(*batch,)``, and its metrics."""
+        loss = self._reduce_loss(error, tensordict, weights=weights)
+        if self.reduction == "none":
+            return TensorDict({name: loss}, batch_size=tensordict.batch_size)
+        return TensorDict({name: loss, **metrics})
+
+    def make_value_estimator(
+        self, value_type: ValueEstimators | None = None, **hyperparams: Any
+    ) -> Any:
+        """Set the value estimator, one of ``SUPPORTED_VALUE_ESTIMATORS``; see ``LossModule``."""
+        value_type, hyperparams = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
+        if value_type is not None:
+            dispatch_value_estimator(
+                self,
+                value_type,
+                supported=self.SUPPORTED_VALUE_ESTIMATORS,
+                tensor_keys={"value_target": "value_target", **self._estimator_keys()},
+                value_network=None,
+                **hyperparams,
+            )
+        return self
+
+    def _estimator_keys(self) -> dict[str, NestedKey]:
+        names = ("value", "reward", "done", "terminated")
+        return {name: getattr(self.tensor_keys, name) for name in names}
+
+    def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
+        if self._value_estimator is not None:
+            self._value_estimator.set_keys(**self._estimator_keys())
+        self._in_keys = None
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Keys that the loss reads; what it may read, such as given draws, is not listed."""
+        if self._in_keys is None:
+            keys, states = self.tensor_keys, self._state_keys()
+            after = (keys.reward, keys.done, keys.terminated, *states)
+            self._in_keys = [keys.action, *states, *map(next_key, after)]
+        return self._in_keys
+
+    @in_keys.setter
+    def in_keys(self, values: list[NestedKey]) -> None:
+        self._in_keys = values
+
+    @property
+    def out_keys(self) -> list[str]:
+        """The losses, then the metrics."""
+        if self._out_keys is None:
+            metrics = () if self.reduction == "none" else self.metric_names
+            self._out_keys = [*self.loss_names, *metrics]
+        return self._out_keys
+
+    @out_keys.setter
+    def out_keys(self, values: list[str]) -> None:
+        self._out_keys = values
+
+
+def next_key(key: NestedKey) -> NestedKey:
+    """The key of the same entry of the next state."""
+    return ("next", key) if isinstance(key, str) else ("next", *key)
