@@ -127,8 +127,8 @@ def finished_sac_run(cfg: DictConfig, run_dir: Path) -> Path:
         train(wanted)
     elif not list_checkpoints(run_dir / "checkpoints"):
         raise RunError(
-            f"{run_dir} holds a run without a checkpoint: it was killed before its first one. "
-            "Delete the directory; the same command then starts anew."
+            f"{run_dir} holds a run without a checkpoint: it is at work, or it was killed before "
+            "its first one. If it was killed, delete the directory; the same command starts anew."
         )
     else:
         stored = OmegaConf.load(run_dir / "config.yaml")

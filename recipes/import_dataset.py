@@ -27,6 +27,7 @@ def import_dataset(cfg: DictConfig) -> OfflineDataset:
     if cfg.format not in IMPORTERS:
         raise DatasetError(f"format={cfg.format}: expected one of {list(IMPORTERS)}.")
     keywords = OmegaConf.to_container(cfg)
+    keywords.update({key: str(keywords[key]) for key in ("source", "path")})  # a number is a name
     importer = IMPORTERS[keywords.pop("format")]
     if keywords["action_bounds"] is None:
         del keywords["action_bounds"]
@@ -57,6 +58,8 @@ def main(cfg: DictConfig) -> None:
         print(summary(import_dataset(cfg)))
     except DatasetError as error:
         raise SystemExit(f"error: {error}") from None
+    except KeyboardInterrupt:
+        raise SystemExit("stopped: nothing was imported. The same command begins anew.") from None
 
 
 if __name__ == "__main__":

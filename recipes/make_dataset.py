@@ -32,6 +32,7 @@ from import_dataset import summary
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_aca.offline import DatasetError, DatasetWriter, OfflineDataset, reference_scores
+from torchrl_aca.offline.registry import ROOT
 from torchrl_aca.training.config import require
 from torchrl_aca.training.envs import make_env
 from torchrl_aca.training.errors import RunError
@@ -50,7 +51,7 @@ def make_dataset(cfg: DictConfig) -> OfflineDataset:
     validate(cfg)
     env = make_env(cfg.env.name)
     task = task_name(cfg.env.name)
-    path = Path(cfg.path or f"datasets/{task}-{cfg.tier}")
+    path = Path(cfg.path or Path(ROOT) / f"{task}-{cfg.tier}")
     if path.exists():
         raise DatasetError(f"{path} exists already. Choose another path, or delete it first.")
     source = None
@@ -66,14 +67,14 @@ def make_dataset(cfg: DictConfig) -> OfflineDataset:
         for episode in episodes_of(cfg, env, source):
             writer.add_episode(**episode)
         if cfg.check:
-            check_returns(cfg, [r for i, r in enumerate(writer.returns) if i not in writer.cut])
+            check_returns(cfg, writer.complete(writer.returns))
         dataset = writer.finish(
             name=f"{task} {cfg.tier} (D4RL-style, locally generated)",
             env_id=cfg.env.name,
             reference_scores=reference_scores(cfg.env.name),
             provenance=provenance(cfg, source),
         )
-    plot_returns(path / "returns.png", dataset.episode_returns(), dataset.metadata["name"])
+    plot_returns(path / "returns.png", writer.complete(writer.returns), dataset.metadata["name"])
     return dataset
 
 
@@ -140,6 +141,8 @@ def main(cfg: DictConfig) -> None:
         print(summary(make_dataset(cfg)))
     except (DatasetError, RunError) as error:
         raise SystemExit(f"error: {error}") from None
+    except KeyboardInterrupt:
+        raise SystemExit("stopped: no data set was made. The same command begins anew.") from None
 
 
 if __name__ == "__main__":

@@ -18,14 +18,20 @@ from typing import Any
 import hydra
 from agents import AGENTS
 from hydra.core.hydra_config import HydraConfig
-from offline_data import generate_missing, load_offline_data, make_mixture, offline_facts
-from omegaconf import DictConfig
+from offline_data import (
+    generate_missing,
+    load_offline_data,
+    make_mixture,
+    offline_facts,
+    score_range,
+)
+from omegaconf import DictConfig, OmegaConf
 from online_mujoco import make_agent, make_collector, make_device, report_extras, updates_due
 
-from torchrl_aca.offline import DatasetError, reference_scores
+from torchrl_aca.offline import DatasetError
 from torchrl_aca.offline.scores import normalized_score
 from torchrl_aca.training.checkpoint import Counters, restore
-from torchrl_aca.training.config import require, resumed_config, validate
+from torchrl_aca.training.config import is_count, is_number, require, resumed_config, validate
 from torchrl_aca.training.data import EpisodeTracker, transitions
 from torchrl_aca.training.envs import EnvState, make_vector_env
 from torchrl_aca.training.errors import RunError
@@ -48,6 +54,7 @@ def train(cfg: DictConfig, checkpoint: dict[str, Any] | None = None) -> Path:
     eval_env = make_vector_env(cfg.env.name, cfg.eval.episodes, cfg.eval.seed)
     agent = make_agent(cfg, env, device)
     dataset = load_offline_data(cfg, env)
+    scores = score_range(cfg, dataset)
     buffer = make_mixture(cfg, dataset)
     episodes, means, counters = EpisodeTracker(cfg.collector.num_envs), MetricMeans(), Counters()
     parts = {
@@ -70,7 +77,7 @@ def train(cfg: DictConfig, checkpoint: dict[str, Any] | None = None) -> Path:
 
     def evaluation() -> dict[str, float]:
         result = evaluate(agent.policy, eval_env, cfg.eval.seed, device)
-        if scores := reference_scores(cfg.env.name):
+        if scores:
             result["normalized_score"] = normalized_score(result["return_mean"], scores)
         return result
 
@@ -108,14 +115,19 @@ def complete(cfg: DictConfig) -> None:
     Raises:
         RunError: Naming the key, what was expected and what was got.
     """
-    fraction, frames = cfg.offline_fraction, cfg.online_frames
-    fits = isinstance(fraction, int | float) and 0 <= fraction <= 1
+    fraction = cfg.offline_fraction
+    fits = is_number(fraction) and 0 <= fraction <= 1
     require(fits, cfg, "offline_fraction", "a share from 0 to 1")
-    require(isinstance(frames, int) and frames > 0, cfg, "online_frames", "a positive integer")
-    require(isinstance(cfg.utd, int | float) and cfg.utd > 0, cfg, "utd", "a number above 0")
+    fits = cfg.dataset is None or isinstance(cfg.dataset, str)
+    require(fits, cfg, "dataset", "the directory of a data set, aca:NAME, or null")
+    for key in ("online_frames", "collector.init_random_frames"):
+        require(is_count(OmegaConf.select(cfg, key)), cfg, key, "a positive integer")
+    for key in ("utd", "optim.utd_ratio"):
+        value = OmegaConf.select(cfg, key)
+        require(is_number(value) and value > 0, cfg, key, "a number above 0")
     if cfg.optim.total_updates is None:
         warmup = cfg.collector.init_random_frames
-        cfg.optim.total_updates = updates_due(cfg, warmup + frames)
+        cfg.optim.total_updates = updates_due(cfg, warmup + cfg.online_frames)
 
 
 @hydra.main(version_base="1.3", config_path="configs", config_name="o2o_halfcheetah")

@@ -13,8 +13,10 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 from torchrl.envs import EnvBase
 
-from torchrl_aca.offline import MixedReplayBuffer, OfflineDataset
+from torchrl_aca.offline import MixedReplayBuffer, OfflineDataset, reference_scores
 from torchrl_aca.offline.layout import METADATA_FILE, sha256
+from torchrl_aca.offline.registry import ROOT
+from torchrl_aca.offline.scores import Scores
 from torchrl_aca.training.config import require
 from torchrl_aca.training.data import TRANSITION_KEYS, make_replay_buffer
 from torchrl_aca.training.errors import RunError
@@ -32,10 +34,10 @@ def dataset_path(cfg: DictConfig) -> Path:
             "recipes/make_dataset.py, or learn without: offline_fraction=0."
         )
     prefix, colon, name = cfg.dataset.partition(":")
-    if not colon:
+    if not colon or Path(cfg.dataset).is_dir():
         return Path(cfg.dataset)
     if prefix == "aca":  # what `load_dataset("aca:NAME")` of `register_datasets` reads
-        return Path("datasets") / name
+        return Path(ROOT) / name
     raise RunError(
         f"dataset={cfg.dataset}: expected a directory, or aca:NAME for datasets/NAME. Bring other "
         "data in with recipes/import_dataset.py first. TorchRL's own readers are not used, because "
@@ -65,7 +67,9 @@ def generate_missing(cfg: DictConfig) -> None:
         raise RunError(f"generate: {message}; expected keys of make_dataset.yaml.") from None
     recipe.path = str(dataset_path(cfg))
     print(f"generating {recipe.path}", flush=True)
+    threads = torch.get_num_threads()
     make_dataset(recipe)
+    torch.set_num_threads(threads)  # the SAC run behind some data sets its own
 
 
 def load_offline_data(cfg: DictConfig, env: EnvBase) -> OfflineDataset | None:
@@ -77,7 +81,7 @@ def load_offline_data(cfg: DictConfig, env: EnvBase) -> OfflineDataset | None:
     """
     if not cfg.offline_fraction:
         return None
-    dataset = OfflineDataset.load(dataset_path(cfg))
+    dataset = OfflineDataset.load(dataset_path(cfg), verify=True)
     require_fit(cfg, dataset.metadata, env)
     return dataset
 
@@ -101,10 +105,17 @@ def require_fit(cfg: DictConfig, metadata: Mapping[str, Any], env: EnvBase) -> N
     low, high = (torch.tensor(metadata["action_bounds"][side]) for side in ("low", "high"))
     if (low < actions.space.low).any() or (high > actions.space.high).any():
         raise RunError(
-            f"{name} has actions between {low.tolist()} and {high.tolist()}; expected them within "
+            f"{name} has action_bounds {low.tolist()} and {high.tolist()}; expected them within "
             f"{actions.space.low.tolist()} and {actions.space.high.tolist()}, which {cfg.env.name} "
-            "takes. Rescale them, or import the data with the environment's action_bounds."
+            "takes. Import the data with the environment's action_bounds, or rescale the actions."
         )
+
+
+def score_range(cfg: DictConfig, dataset: OfflineDataset | None) -> Scores | None:
+    """The returns that count as 0 and 100: the data set's, or else those known for the task."""
+    if dataset is not None and (own := dataset.metadata["reference_scores"]):
+        return own["min"], own["max"]
+    return reference_scores(cfg.env.name)
 
 
 def make_mixture(cfg: DictConfig, dataset: OfflineDataset | None) -> MixedReplayBuffer:

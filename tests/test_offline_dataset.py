@@ -133,17 +133,75 @@ def test_what_a_killed_writer_left_does_not_load_and_is_replaced(tmp_path):
 
 def test_of_two_writers_with_one_path_the_second_one_finishes(tmp_path):
     first, second = (DatasetWriter(tmp_path / "data", OBSERVATION_DIM, ACTION_DIM) for _ in "12")
-    with second:
-        with pytest.raises(DatasetError, match="another one has begun to write"), first:
-            second.__enter__()  # as if it began while the first one is at work
-            first.add_episode(**EPISODES[0])
-            first.finish(name="first")
-        for episode in EPISODES:
-            second.add_episode(**episode)
-        dataset = second.finish(name="second")
+    with pytest.raises(DatasetError, match="another one has begun to write"), first:
+        second.__enter__()  # while the first one is at work
+        first.add_episode(**EPISODES[0])
+        first.finish(name="first")
+    for each in EPISODES:
+        second.add_episode(**each)
+    dataset = second.finish(name="second")
+    second.__exit__(None, None, None)
     assert dataset.metadata["name"] == "second" and len(dataset.data) == SIZE
     assert list(tmp_path.iterdir()) == [dataset.path]
     assert not (dataset.path / "owner").exists()
+
+
+def test_a_directory_of_another_program_is_left_alone(tmp_path):
+    (tmp_path / "data.partial").mkdir()
+    (tmp_path / "data.partial" / "thesis.txt").write_text("years")
+    with pytest.raises(
+        DatasetError, match=r"data.partial is in the way, and no writer has made it"
+    ):
+        write(tmp_path / "data", EPISODES)
+    assert (tmp_path / "data.partial" / "thesis.txt").read_text() == "years"
+
+
+def test_a_path_that_was_taken_meanwhile_is_told_and_nothing_is_kept(tmp_path):
+    path = tmp_path / "data"
+    with (
+        pytest.raises(DatasetError, match="data cannot be made .*nothing was kept"),
+        DatasetWriter(path, OBSERVATION_DIM, ACTION_DIM) as writer,
+    ):
+        for each in EPISODES:
+            writer.add_episode(**each)
+        path.mkdir()
+        (path / "thesis.txt").write_text("years")
+        writer.finish(name="test")
+    assert [left.name for left in tmp_path.iterdir()] == ["data"]
+    assert [left.name for left in path.iterdir()] == ["thesis.txt"]
+
+
+def test_a_writer_writes_one_data_set(tmp_path):
+    writer = DatasetWriter(tmp_path / "data", OBSERVATION_DIM, ACTION_DIM)
+    with pytest.raises(KeyError), writer:
+        writer.add_episode(**EPISODES[0])
+        raise KeyError
+    with pytest.raises(DatasetError, match="one data set"):
+        writer.__enter__()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_that_lost_rows_on_the_way_is_found(tmp_path):
+    with (
+        pytest.raises(DatasetError, match=r"reward.memmap has \d+ bytes; expected"),
+        DatasetWriter(tmp_path / "data", OBSERVATION_DIM, ACTION_DIM) as writer,
+    ):
+        for each in EPISODES:
+            writer.add_episode(**each)
+        file = writer._files["next", "reward"]
+        file.flush()
+        file.truncate(4)
+        writer.finish(name="test")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_sizes_may_be_numpy_integers(tmp_path):
+    sizes = np.int64(OBSERVATION_DIM), np.int64(ACTION_DIM)
+    with DatasetWriter(tmp_path / "data", *sizes) as writer:
+        for each in EPISODES:
+            writer.add_episode(**each)
+        dataset = writer.finish(name="test")
+    assert dataset.metadata["observation_dim"] == OBSERVATION_DIM
 
 
 def test_forgetting_finish_is_an_error(tmp_path):
@@ -250,6 +308,29 @@ def test_rows_that_do_not_follow_each_other_are_refused_unless_allowed(tmp_path)
     assert write(tmp_path / "data", episodes, check_continuity=False).metadata["jumps"] == 1
 
 
+@pytest.mark.parametrize("wrong", ["zeros", "the first observation of the episode after it"])
+def test_time_limits_that_lead_nowhere_are_refused_unless_allowed(tmp_path, wrong):
+    episodes = [episode(4, seed=n) for n in range(3)]
+    for number, each in enumerate(episodes):
+        following = episodes[(number + 1) % 3]["observation"][0]
+        each["next_observation"][-1] = 0 if wrong == "zeros" else following
+    with pytest.raises(DatasetError, match=f"at every time limit next.observation is {wrong}"):
+        write(tmp_path / "data", episodes)
+    write(tmp_path / "data", episodes, check_continuity=False)
+    # One right time limit tells that the recorder reads what was reached.
+    episodes[0]["next_observation"][-1] = 0.5
+    write(tmp_path / "right", episodes)
+
+
+def test_terminal_states_and_cut_recordings_may_lead_anywhere(tmp_path):
+    episodes = [episode(4, "terminated", seed=n) for n in range(2)]
+    for each in episodes:
+        each["next_observation"][-1] = 0
+    cut = {**episode(3, seed=5), "complete": False}
+    cut["next_observation"][-1] = 0
+    write(tmp_path / "data", [*episodes, cut])
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -258,11 +339,17 @@ def test_rows_that_do_not_follow_each_other_are_refused_unless_allowed(tmp_path)
         ({"action_bounds": (1, -1)}, "low < high"),
         ({"action_bounds": (-np.inf, np.inf)}, "finite"),
         ({"action_bounds": ([-1] * 3, [1] * 3)}, "two lists of 2 numbers"),
+        ({"action_bounds": 2}, r"action_bounds=2: expected \(low, high\)"),
+        ({"action_bounds": [1]}, r"action_bounds=\[1\]: expected \(low, high\)"),
+        ({"allow_constant": None}, "allow_constant=None: expected a collection"),
+        ({"observation_dim": 0}, "observation_dim=0: expected an integer of at least 1"),
+        ({"action_dim": 2.5}, "action_dim=2.5: expected an integer"),
     ],
 )
 def test_senseless_options_are_refused_before_any_file_is_made(tmp_path, options, message):
+    sizes = {"observation_dim": OBSERVATION_DIM, "action_dim": ACTION_DIM}
     with pytest.raises(DatasetError, match=message):
-        DatasetWriter(tmp_path / "data", OBSERVATION_DIM, ACTION_DIM, **options)
+        DatasetWriter(tmp_path / "data", **{**sizes, **options})
     assert list(tmp_path.iterdir()) == []
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -137,6 +139,12 @@ def test_other_reference_scores_and_other_bounds_can_be_given(source, tmp_path):
 ROWS = len(joined(EPISODES, "reward"))
 
 
+def shifted() -> np.ndarray:
+    """Next observations as a recorder has them that reads the next row, whatever begins there."""
+    observations = joined(EPISODES, "observation")
+    return np.concatenate([observations[1:], observations[-1:]])
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -151,6 +159,9 @@ ROWS = len(joined(EPISODES, "reward"))
         ({"observations": np.zeros((ROWS, 3))}, "Nothing of observation varies"),
         ({"observations": np.random.default_rng(9).normal(size=(ROWS, 3))}, "inside episodes"),
         ({"rewards": np.full(ROWS, np.nan)}, "next.reward is nan"),
+        ({"terminals": np.full(ROWS, 0.5)}, "'terminals' has a value of 0.5; expected 0 and 1"),
+        ({"timeouts": np.full(ROWS, np.nan)}, "'timeouts' has a value of nan; expected 0 and 1"),
+        ({"next_observations": shifted()}, "first observation of the episode after it"),
         ({"actions": joined(EPISODES, "action") * 9}, r"expected a number in \[-1.0, 1.0\]"),
     ],
 )
@@ -191,6 +202,58 @@ def test_damage_that_shows_up_in_the_middle_leaves_nothing(source, tmp_path, mon
     with pytest.raises(DatasetError, match="cannot be read to its end"):
         import_d4rl(source, tmp_path / "data", progress=False)
     assert list(tmp_path.iterdir()) == [source]
+
+
+@pytest.mark.parametrize("damage", range(40))
+def test_damage_anywhere_is_told_in_one_message(source, tmp_path, damage):
+    content = bytearray(source.read_bytes())
+    start = 60 * damage
+    content[start : start + 24] = bytes(24)
+    source.write_bytes(content)
+    try:
+        import_d4rl(source, tmp_path / "data", progress=False)
+    except DatasetError:
+        assert list(tmp_path.iterdir()) == [source]
+
+
+def test_a_link_that_leads_nowhere_is_named(source, tmp_path):
+    with h5py.File(source, "r+") as file:
+        del file["actions"]
+        file["actions"] = h5py.SoftLink("/nowhere")
+    with pytest.raises(DatasetError, match="cannot be read to its end"):
+        import_d4rl(source, tmp_path / "data", progress=False)
+
+
+def test_wrong_reference_scores_are_told_before_the_work(tmp_path):
+    for importer in (import_d4rl, import_minari):
+        for scores in (5, (1,), ("a", "b"), (2, 1)):
+            with pytest.raises(DatasetError, match="reference_scores=.*expected .low, high."):
+                importer(tmp_path / "none", tmp_path / "data", reference_scores=scores)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="reads the peak from /proc")
+def test_memory_does_not_grow_with_the_file(tmp_path):
+    """Peak memory of a process that imports two blocks of rows, and of one that imports ten."""
+    peaks = []
+    for count in (100, 500):
+        one = write_d4rl(tmp_path / f"{count}.hdf5", [episode(1000, seed=n) for n in range(count)])
+        with h5py.File(one, "r+") as file:  # wide rows: 28 and 140 MB of them
+            for name in ("observations", "next_observations"):
+                narrow = file[name][:]
+                del file[name]
+                file[name] = np.repeat(narrow, 11, axis=1)
+        script = (
+            "import re, sys\n"
+            "from pathlib import Path\n"
+            "from torchrl_aca.offline import import_d4rl\n"
+            "import_d4rl(*sys.argv[1:], progress=False)\n"
+            "print(re.search(r'VmHWM:\\s+(\\d+)', Path('/proc/self/status').read_text())[1])"
+        )
+        typed = [sys.executable, "-c", script, str(one), str(tmp_path / f"data{count}")]
+        output = subprocess.run(typed, capture_output=True, text=True, check=True).stdout
+        peaks.append(int(output) / 1024)
+    assert peaks[1] - peaks[0] < 30  # MiB
 
 
 def test_an_interrupted_import_leaves_nothing_and_can_be_repeated(source, tmp_path, monkeypatch):

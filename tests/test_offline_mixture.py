@@ -268,6 +268,8 @@ def test_offline_rows_are_identified_and_not_saved(tmp_path):
         ("dtype", "expected offline fingerprint"),
         ("keys", "expected keys .* got .'observation'"),
         ("capacity", "expected online capacity 100, got 50"),
+        ("fraction", "expected offline_fraction 1/2, got 1/4"),
+        ("batch", "expected batch_size 256, got 64"),
     ],
 )
 def test_the_state_of_another_mixture_is_refused_and_nothing_changes(change, message):
@@ -279,13 +281,33 @@ def test_the_state_of_another_mixture_is_refused_and_nothing_changes(change, mes
         offline["action"] = offline["action"].half()
     keys = ["observation", ("next", "reward")] if change == "keys" else None
     online = online_buffer(capacity=50 if change == "capacity" else 100)
-    other = MixedReplayBuffer(offline, online, keys=keys)
+    shares = {"fraction": {"offline_fraction": 0.25}, "batch": {"batch_size": 64}}.get(change, {})
+    other = MixedReplayBuffer(offline, online, keys=keys, **shares)
     with pytest.raises(ValueError, match=f"another mixture: {message}"):
         other.load_state_dict(state)
     assert len(other.online) == 0
 
 
+def test_one_changed_row_among_many_makes_other_data():
+    data, online = rows(5_000), online_buffer(7)
+    state = MixedReplayBuffer(data, online).state_dict()
+    data["next", "reward"][4_321] += 1
+    with pytest.raises(ValueError, match="expected offline fingerprint"):
+        MixedReplayBuffer(data, online).load_state_dict(state)
+
+
 # --- errors ---------------------------------------------------------------------------------------
+
+
+def test_returns_over_several_steps_are_not_mixed_with_single_steps():
+    several = rows(4).set("steps_to_next_obs", torch.full((4, 1), 3))
+    with pytest.raises(
+        ValueError, match="'steps_to_next_obs', so its rewards are sums over several"
+    ):
+        mixture().extend(several)
+    both = MixedReplayBuffer(several, online_buffer())
+    both.extend(several)
+    assert (both.sample(8)["steps_to_next_obs"] == 3).all()
 
 
 @pytest.mark.parametrize("fraction", [-0.1, 1.1, float("nan")])

@@ -51,10 +51,13 @@ ALGORITHMS = {
         "aca.alpha_interval=20",
     ],
     "rlpd": ["algo=rlpd", "rlpd.num_cells=[16,16]", "rlpd.num_qvalue_nets=3"],
+    "wsrl": ["algo=rlpd", "variant=wsrl", "rlpd.num_cells=[16,16]", "rlpd.num_qvalue_nets=3"],
 }
 
 
-def record(path: Path, env_id: str | None = "Hopper-v4", sizes=SIZES, bound=1.0, seed=0) -> Path:
+def record(
+    path: Path, env_id="Hopper-v4", sizes=SIZES, bound=1.0, seed=0, reference_scores=None
+) -> Path:
     """Three episodes of noise with rewards that no online transition has."""
     random = np.random.default_rng(seed)
     with DatasetWriter(path, **sizes, action_bounds=(-bound, bound)) as writer:
@@ -68,7 +71,7 @@ def record(path: Path, env_id: str | None = "Hopper-v4", sizes=SIZES, bound=1.0,
                 np.zeros(40, bool),
                 np.arange(40) == 39,
             )
-        writer.finish(name="noise", env_id=env_id)
+        writer.finish(name="noise", env_id=env_id, reference_scores=reference_scores)
     return path
 
 
@@ -117,6 +120,9 @@ def test_the_command_trains_and_its_card_names_the_data(algo, data, tmp_path):
     metrics = rows_of(tmp_path / "here" / "metrics.csv")
     assert [int(row["updates"]) for row in metrics] == [10, 20, 30, 40, 50, 60]
     assert [int(row["frames"]) for row in metrics] == [60, 70, 80, 90, 100, 110]
+    evaluations = rows_of(tmp_path / "here" / "eval.csv")
+    assert [int(row["updates"]) for row in evaluations] == [0, 30, 60]
+    assert [int(row["frames"]) for row in evaluations] == [0, 80, 110]
     card = (tmp_path / "here" / "card.md").read_text()
     assert re.search(r"\| offline data \| noise, 120 transitions, mean return 4\d{4}\.\d \|", card)
     assert sha256(data / "metadata.json") in card
@@ -167,12 +173,12 @@ def seen(recipes, monkeypatch) -> list[torch.Tensor]:
 
         return make_agent
 
-    for algo in ALGORITHMS:
+    for algo in ("aca", "rlpd"):
         monkeypatch.setitem(agents, algo, watched(agents[algo]))
     return batches
 
 
-@pytest.mark.parametrize("algo", ALGORITHMS)
+@pytest.mark.parametrize("algo", ["aca", "rlpd"])
 @pytest.mark.parametrize(
     ("fraction", "offline"), [("0.5", 8), ("0.25", 4), ("0", 0), ("1", 16), ("0.3", 5)]
 )
@@ -250,6 +256,27 @@ def test_the_quickstart_makes_its_data_and_scores_are_normalised(train, tmp_path
     assert f"| normalised score | {score:.1f} |" in (run_dir / "card.md").read_text()
 
 
+def test_generating_data_leaves_the_number_of_threads(recipes, tmp_path, monkeypatch):
+    module = recipes("offline_data")
+    monkeypatch.setattr(module, "make_dataset", lambda cfg: torch.set_num_threads(1))
+    typed = [f"dataset={tmp_path / 'made'}", "generate={tier: medium}"]
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+        module.generate_missing(compose("o2o_halfcheetah", typed))
+    after = torch.get_num_threads()
+    torch.set_num_threads(before)
+    assert after == 2
+
+
+def test_scores_are_those_of_the_data_set(train, tmp_path):
+    path = record(tmp_path / "noise", reference_scores=(-50.0, 150.0))
+    run_dir = train(*settings(path, tmp_path / "here"), "optim.total_updates=2")
+    for row in rows_of(run_dir / "eval.csv"):
+        expected = (float(row["return_mean"]) + 50) / 2
+        assert float(row["normalized_score"]) == pytest.approx(expected)
+
+
 def test_the_quickstart_makes_its_data_and_is_short():
     quick, usual = composed(name="o2o_quickstart"), composed(name="o2o_halfcheetah")
     assert quick.algo.name == usual.algo.name == "aca"
@@ -269,6 +296,12 @@ def test_the_quickstart_makes_its_data_and_is_short():
         (["env=walker2d"], "is of Hopper-v4; expected data of Walker2d-v4"),
         (["offline_fraction=1.5"], "offline_fraction=1.5: expected a share from 0 to 1"),
         (["offline_fraction=-0.1"], "offline_fraction=-0.1: expected a share"),
+        (["offline_fraction=true"], "offline_fraction=True: expected a share"),
+        (["dataset=123"], "dataset=123: expected the directory of a data set"),
+        (["collector.init_random_frames=some"], "init_random_frames='some': expected a positive"),
+        (["optim.utd_ratio=null"], "optim.utd_ratio=None: expected a number above 0"),
+        (["utd=true"], "utd=True: expected a number above 0"),
+        (["utd=inf"], "utd=inf: expected a number above 0"),
         (["offline_fraction=half"], "offline_fraction='half': expected a share"),
         (["utd=0"], "utd=0: expected a number above 0"),
         (["utd=-1"], "utd=-1: expected a number above 0"),
@@ -297,7 +330,7 @@ def test_mistakes_are_told_before_any_work(overrides, message, data, train, tmp_
             {"env_id": None, "sizes": {"observation_dim": 17, "action_dim": 6}},
             "other sizes.*expected {'observation': 11, 'action': 3}, got {'observation': 17",
         ),
-        ({"bound": 2.0}, r"actions between \[-2.0.*within \[-1.0"),
+        ({"bound": 2.0}, r"action_bounds \[-2.0.*within \[-1.0"),
     ],
 )
 def test_data_that_do_not_fit_the_environment_are_refused(options, message, train, tmp_path):
@@ -305,6 +338,16 @@ def test_data_that_do_not_fit_the_environment_are_refused(options, message, trai
     with pytest.raises(RunError, match=message):
         train(*settings(path, tmp_path / "here"))
     assert not (tmp_path / "here").exists()
+
+
+def test_data_that_were_changed_on_disk_are_refused(data, train, tmp_path):
+    path = shutil.copytree(data, tmp_path / "noise")
+    file = path / "next" / "reward.memmap"
+    content = bytearray(file.read_bytes())
+    content[:4] = np.float32(np.nan).tobytes()
+    file.write_bytes(content)
+    with pytest.raises(DatasetError, match="reward.memmap has SHA-256 .*was changed"):
+        train(*settings(path, tmp_path / "here"))
 
 
 def test_a_missing_data_set_is_told_in_one_message(train, tmp_path):

@@ -252,6 +252,15 @@ def test_what_follows_a_terminal_state_counts_for_nothing():
     torch.testing.assert_close(seeded(loss.qvalue_loss, data), expected)
 
 
+def test_returns_over_several_steps_are_discounted_over_these():
+    loss, data = make_loss(), make_data(BATCH)
+    data["next", "reward"].zero_()
+    one = seeded(loss.qvalue_loss, data)["target_value"]
+    data["steps_to_next_obs"] = torch.full((BATCH, 1), 3)
+    three = seeded(loss.qvalue_loss, data)["target_value"]
+    assert three == pytest.approx(GAMMA**2 * one.item(), **EXACT)
+
+
 def test_metrics_are_those_of_the_losses():
     loss, data = make_loss(), make_data(BATCH)
     out = seeded(loss.actor_loss, data)

@@ -213,6 +213,17 @@ def test_one_evaluation_or_no_return_to_reach_never_stops_a_run():
     assert not has_reached(rows, None)
 
 
+def test_a_run_belongs_to_one_process_until_it_ends(tmp_path):
+    cfg, counters = settings(tmp_path), Counters(frames=1)
+    cfg.resume = str(tmp_path / "run")
+    first = Run(settings(tmp_path), {"counters": counters}, counters, False, "recipe.py")
+    with first, pytest.raises(RunError, match="run: another process is at work on this run"):
+        Run(cfg, {"counters": counters}, counters, True, "recipe.py")
+    assert not (tmp_path / "run" / "at_work").exists()
+    with Run(cfg, {"counters": counters}, counters, True, "recipe.py") as run:
+        assert run.dir == tmp_path / "run"
+
+
 def test_a_stopped_run_names_the_recipe_that_goes_on_with_it(tmp_path, capsys):
     counters = Counters(updates=3, frames=3)
     with Run(settings(tmp_path), {"counters": counters}, counters, False, "recipe.py") as run:

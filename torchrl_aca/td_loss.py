@@ -48,8 +48,11 @@ class TDLoss(LossModule):
             data: rewards and flags below ``"next"``; the next value is written to it.
             next_value: ``V(s')``, shape ``(*batch, 1)``.
         """
+        keys = self.tensor_keys
+        # The estimator would go on without one of these: a KeyError names it.
+        data.select(*map(next_key, (keys.reward, keys.done, keys.terminated)))
         # A terminal state may hold anything, NaN included: its value is zero, not zero times that.
-        terminated = data[next_key(self.tensor_keys.terminated)]
+        terminated = data[next_key(keys.terminated)]
         next_value = next_value.masked_fill(terminated.reshape(next_value.shape), 0.0)
         data.set(next_key(self.value_estimator.tensor_keys.value), next_value)
         return self.value_estimator.value_estimate(data).reshape(next_value.shape)

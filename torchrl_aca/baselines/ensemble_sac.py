@@ -16,7 +16,7 @@ from torchrl.data import Bounded, Composite, TensorSpec
 from torchrl.modules import ProbabilisticActor
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 
-from torchrl_aca.td_loss import TDLoss, next_key
+from torchrl_aca.td_loss import TDLoss
 
 __all__ = ["EnsembleSACLoss"]
 
@@ -279,7 +279,6 @@ class EnsembleSACLoss(TDLoss):
     @torch.no_grad()
     def _target_value(self, tensordict: TensorDictBase) -> Tensor:
         """TD target ``y`` of shape ``(*batch, 1)``, made by the value estimator."""
-        keys = self.tensor_keys
         next_action, log_prob = self._sample(tensordict["next"])
         members = self._subset()
         # Only the members in M are evaluated: with two of ten, a fifth of the work.
@@ -288,8 +287,7 @@ class EnsembleSACLoss(TDLoss):
         next_value = next_values.amin(-1, keepdim=True)
         if self.entropy_backup:
             next_value = next_value - self.alpha * log_prob.unsqueeze(-1)
-        data = tensordict.select(*map(next_key, (keys.reward, keys.done, keys.terminated)))
-        return self._td_target(data, next_value)
+        return self._td_target(tensordict.clone(recurse=False), next_value)
 
     def _state_keys(self) -> list[NestedKey]:
         networks = [*self.actor_network.in_keys, *self.qvalue_network.in_keys]

@@ -36,7 +36,8 @@ class DatasetChecks:
         action_low: Smallest allowed action, shape (A,).
         action_high: Largest allowed action, shape (A,).
         allow_constant: Which of "observation", "action" and "reward" may have constant columns.
-        check_continuity: Whether jumps between successive rows of an episode are an error.
+        check_continuity: Whether it is an error if rows of an episode do not follow on each other,
+            or if time limits lead to what cannot be the state that was reached.
     """
 
     def __init__(
@@ -46,21 +47,29 @@ class DatasetChecks:
         allow_constant: Collection[str] = (),
         check_continuity: bool = True,
     ) -> None:
-        if isinstance(allow_constant, str) or not set(allow_constant) <= VARYING.keys():
+        names = allow_constant if isinstance(allow_constant, Collection) else [allow_constant]
+        if isinstance(names, str) or not set(names) <= VARYING.keys():
             raise DatasetError(
                 f"allow_constant={allow_constant!r}: expected a collection of some of "
                 f"{list(VARYING)}, such as ('observation',)."
             )
         self.action_low, self.action_high = action_low, action_high
-        self.allow_constant = set(allow_constant)
+        self.allow_constant = set(names)
         self.check_continuity = check_continuity
         self.episodes = self.rows = self.pairs = self.jumps = 0
         self.first_jump = ""
+        self.limits = self.zeros = 0  # time limits, and those with a next observation of zeros
+        self.followed = self.restarts = 0  # time limits before an episode, and those that begin it
+        self.reached: torch.Tensor | None = None  # the latest time limit's next observation
         self.low: dict[str, torch.Tensor] = {}
         self.high: dict[str, torch.Tensor] = {}
 
-    def add(self, rows: Mapping[NestedKey, torch.Tensor]) -> None:
-        """Checks one episode, given as L rows for each key of the canonical form.
+    def add(self, rows: Mapping[NestedKey, torch.Tensor], complete: bool = True) -> None:
+        """Checks one episode.
+
+        Args:
+            rows: L rows for each key of the canonical form.
+            complete: False where the recording cut the episode short.
 
         Raises:
             DatasetError: If a number is not finite, an action is out of bounds, or the episode
@@ -71,6 +80,7 @@ class DatasetChecks:
         self._check_bounds(rows["action"], where)
         self._check_end(rows["next", "done"].squeeze(-1), where)
         self._count_jumps(rows["observation"], rows["next", "observation"])
+        self._count_limits(rows, complete)
         for name, key in VARYING.items():
             low, high = rows[key].amin(0), rows[key].amax(0)
             self.low[name] = torch.minimum(self.low.get(name, low), low)
@@ -85,8 +95,8 @@ class DatasetChecks:
             For the metadata: the constant columns that were allowed, and the number of jumps.
 
         Raises:
-            DatasetError: If there is no episode, a column never varies, or successive rows of an
-                episode do not fit together.
+            DatasetError: If there is no episode, a column never varies, successive rows of an
+                episode do not fit together, or no time limit has the state that it led to.
         """
         if not self.episodes:
             raise DatasetError("there is no episode to store: expected at least one add_episode().")
@@ -99,6 +109,7 @@ class DatasetChecks:
                 "numbers: the episodes may be cut at wrong rows. If the recording is meant to be "
                 "so, pass check_continuity=False."
             )
+        self._check_limits()
         return {"constant_columns": constant, "jumps": self.jumps}
 
     def _check_finite(self, rows: Mapping[NestedKey, torch.Tensor], where: str) -> None:
@@ -144,6 +155,32 @@ class DatasetChecks:
             )
         self.pairs += len(reached)
         self.jumps += len(jumps)
+
+    def _count_limits(self, rows: Mapping[NestedKey, torch.Tensor], complete: bool) -> None:
+        """A time limit's next observation is bootstrapped from, and no row after it tells of it."""
+        first, last = rows["observation"][0], rows["next", "observation"][-1]
+        if self.reached is not None:
+            self.followed += 1
+            self.restarts += int(torch.equal(self.reached, first))
+        limit = complete and not rows["next", "terminated"][-1]
+        self.reached = last.clone() if limit else None
+        self.limits += int(limit)
+        self.zeros += int(limit and not last.any())
+
+    def _check_limits(self) -> None:
+        """One such observation may be chance, all of them are a recorder that wrote another one."""
+        found = {
+            "zeros": self.limits > 0 and self.zeros == self.limits,
+            "the first observation of the episode after it": 0 < self.followed == self.restarts,
+        }
+        for what, everywhere in found.items():
+            if everywhere and self.check_continuity:
+                raise DatasetError(
+                    f"at every time limit next.observation is {what}; expected the state that the "
+                    "last action led to, from which values are bootstrapped. Record it before the "
+                    "reset. Of a D4RL file remove `next_observations`: such rows are dropped then. "
+                    "If the recording is meant to be so, pass check_continuity=False."
+                )
 
     def _constant_columns(self) -> dict[str, list[int]]:
         constant = {

@@ -63,7 +63,7 @@ class OfflineDataset:
         size = metadata["transitions"]
         layout = row_layout(metadata["observation_dim"], metadata["action_dim"])
         for key, (shape, dtype) in layout.items():
-            _check_file(path / file_name(key), size * row_bytes(shape, dtype))
+            check_file(path / file_name(key), size * row_bytes(shape, dtype))
             if verify:
                 _check_sum(path / file_name(key), metadata["sha256"][file_name(key)])
         data = TensorDict(batch_size=[size])
@@ -176,7 +176,8 @@ def _read_metadata(path: Path) -> dict[str, Any]:
     return metadata
 
 
-def _check_file(path: Path, size: int) -> None:
+def check_file(path: Path, size: int) -> None:
+    """Raises `DatasetError` unless there is a file of so many bytes."""
     found = path.stat().st_size if path.is_file() else None
     if found != size:
         state = "is missing" if found is None else f"has {found} bytes"

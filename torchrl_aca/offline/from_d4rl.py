@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from torchrl_aca.offline.arguments import score_range
 from torchrl_aca.offline.dataset import OfflineDataset
 from torchrl_aca.offline.errors import DatasetError
 from torchrl_aca.offline.importing import provenance_of, reading, write_episodes
@@ -61,6 +62,7 @@ def import_d4rl(
     """
     import h5py
 
+    score_range(reference_scores)  # before the work
     source = Path(source)
     if not source.is_file() or not h5py.is_hdf5(source):
         state = "is no HDF5 file" if source.is_file() else "does not exist"
@@ -68,7 +70,8 @@ def import_d4rl(
     with reading(source):
         file = h5py.File(source, "r")
     with file:
-        columns = _columns(file, source)
+        with reading(source):
+            columns = _columns(file, source)
         size, observation_dim = columns["observations"].shape
         action_dim = columns["actions"].shape[1]
         with DatasetWriter(path, observation_dim, action_dim, **options) as writer:
@@ -80,6 +83,7 @@ def import_d4rl(
                 provenance={
                     **provenance_of("import_d4rl", source.name, source, "h5py"),
                     "dropped_rows": size - sum(writer.lengths),
+                    "next_observations": "stored" if "next_observations" in columns else "inferred",
                 },
             )
 
@@ -116,7 +120,7 @@ def _episodes(columns: Mapping[str, Any], source: Path) -> Iterator[dict[str, An
     """Yields the arguments of `add_episode`, reading about `BLOCK` rows at a time."""
     with reading(source):
         size = len(columns["rewards"])
-        ends = (columns["terminals"][:] != 0) | (columns["timeouts"][:] != 0)
+        ends = _flags(columns, "terminals", source) | _flags(columns, "timeouts", source)
         stops = (ends.nonzero()[0] + 1).tolist()
         if not stops:
             raise DatasetError(
@@ -139,6 +143,14 @@ def _episodes(columns: Mapping[str, Any], source: Path) -> Iterator[dict[str, An
             if len(episode["reward"]):
                 yield episode
             start = stop
+
+
+def _flags(columns: Mapping[str, Any], name: str, source: Path) -> Any:
+    values = columns[name][:]
+    wrong = values[(values != 0) & (values != 1)]
+    if len(wrong):
+        raise DatasetError(f"{source}: {name!r} has a value of {wrong[0]}; expected 0 and 1 only.")
+    return values != 0
 
 
 def _episode(rows: dict[str, torch.Tensor]) -> dict[str, Any]:

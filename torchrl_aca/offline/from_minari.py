@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from torchrl_aca.offline.arguments import score_range
 from torchrl_aca.offline.dataset import OfflineDataset
 from torchrl_aca.offline.errors import DatasetError
 from torchrl_aca.offline.importing import provenance_of, reading, write_episodes
@@ -46,6 +47,7 @@ def import_minari(
         DatasetError: If there is no such data set, it cannot be read to its end, its spaces are no
             vectors, or the data fail a check. Nothing is at `path` then.
     """
+    score_range(reference_scores)  # before the work
     dataset = _open(source)
     observation_dim, action_dim = (
         _vector_length(space, kind, source)
@@ -77,8 +79,9 @@ def _open(source: str | Path) -> Any:
             return minari.load_dataset(str(source))
         inner = directory / "data"
         return minari.MinariDataset(inner if inner.is_dir() else directory)
-    except (OSError, ValueError, KeyError) as error:
-        reason = "nothing found" if isinstance(error, FileNotFoundError) else error
+    except (OSError, ValueError, KeyError, AssertionError) as error:
+        missing = isinstance(error, FileNotFoundError)
+        reason = "nothing found" if missing else repr(error)
         raise DatasetError(
             f"{source} is no Minari data set on this machine ({reason}); expected an id that "
             "`minari list local` shows, or the directory of a data set, which has `data/` in it."
@@ -105,6 +108,11 @@ def _episodes(dataset: Any, source: str | Path) -> Iterator[dict[str, Any]]:
                 raise DatasetError(
                     f"{source}: episode {episode.id} has {observed} observations for {steps} "
                     f"actions; expected {steps + 1}, the last reached one included."
+                )
+            if not steps:
+                raise DatasetError(
+                    f"{source}: episode {episode.id} has no step; expected at least one. Leave "
+                    "such episodes out when the data set is made."
                 )
             truncated = episode.truncations.copy()
             complete = bool(episode.terminations[-1] or truncated[-1])

@@ -25,6 +25,8 @@ from torchrl_aca.training.data import BufferState
 
 __all__ = ["MixedReplayBuffer"]
 
+N_STEPS = "steps_to_next_obs"  # what TorchRL's MultiStepTransform adds, and value estimators need
+
 
 class MixedReplayBuffer:
     """Draws each batch from a fixed offline data set and a growing online buffer, in exact shares.
@@ -111,6 +113,7 @@ class MixedReplayBuffer:
         if offline is not None:
             self._layout = layout_of(self._offline, self.keys, "The offline half")
         self._online_is_checked = False
+        self._fingerprint = fingerprint(self._offline, self.keys)
         self._check_online()
 
     def __len__(self) -> int:
@@ -182,6 +185,12 @@ class MixedReplayBuffer:
             self._online_is_checked = True
 
     def _check(self, rows: TensorDictBase, name: str) -> None:
+        if N_STEPS in rows.keys() - self.keys:
+            raise ValueError(
+                f"{name} has {N_STEPS!r}, so its rewards are sums over several steps, but the "
+                f"mixture's keys are {self.keys}. Give the offline half the same n-step return and "
+                "key, or leave MultiStepTransform out."
+            )
         layout = layout_of(rows, self.keys, name)
         self._layout = self._layout or layout
         require_layout(layout, self._layout, name)
@@ -202,7 +211,7 @@ class MixedReplayBuffer:
         """Restore what :meth:`state_dict` returned; the next batches are those that were due.
 
         Raises:
-            ValueError: if the offline data, the keys or the capacity are not those of the state.
+            ValueError: if shares, batch size, offline data, keys or capacity are not the state's.
         """
         for name, got in self._built_from().items():
             if (expected := state_dict["built_from"][name]) != got:
@@ -215,12 +224,13 @@ class MixedReplayBuffer:
 
     def _built_from(self) -> dict[str, Any]:
         """What a state does not hold, but is good for alone."""
-        rows = len(self._offline)
         return {
+            "offline_fraction": str(self._fraction),
+            "batch_size": self.batch_size,
             "online capacity": self.online.storage.max_size,
             "keys": self.keys,
-            "offline rows": rows,
-            "offline fingerprint": fingerprint(self._offline, self.keys) if rows else None,
+            "offline rows": len(self._offline),
+            "offline fingerprint": self._fingerprint,
         }
 
     def dumps(self, path: str | Path) -> None:

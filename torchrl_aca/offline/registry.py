@@ -10,6 +10,8 @@ from torchrl.data.datasets import register_dataset
 
 from torchrl_aca.offline.dataset import OfflineDataset
 
+ROOT = "datasets"  # where data sets are found by name
+
 
 def register_datasets() -> None:
     """Makes `load_dataset("aca:<name>", batch_size=..., root=...)` return a replay buffer.
@@ -25,7 +27,7 @@ def load_replay_buffer(
     name: str,
     *,
     batch_size: int,
-    root: str | Path = "datasets",
+    root: str | Path = ROOT,
     verify: bool = False,
     clip_actions: float | None = None,
     **kwargs: Any,

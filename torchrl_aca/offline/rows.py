@@ -12,6 +12,7 @@ from torchrl.data import RandomSampler, ReplayBuffer, TensorStorage
 
 __all__ = ["Layout", "fingerprint", "layout_of", "require_layout", "require_plain", "rows_of"]
 
+BLOCK = 100_000  # rows that a fingerprint reads at a time
 Layout = dict[NestedKey, tuple[torch.dtype, tuple[int, ...], torch.device]]
 
 
@@ -102,14 +103,12 @@ def _describe(dtype: torch.dtype, shape: tuple[int, ...], device: torch.device) 
 
 
 def fingerprint(rows: TensorDictBase, keys: Sequence[NestedKey]) -> str:
-    """SHA-256 of about 1,000 evenly spaced rows: tells data sets apart, in milliseconds.
-
-    It does not notice a change in a row between these.
-    """
+    """SHA-256 of all rows, read a block at a time: about a second for a million transitions."""
     digest = hashlib.sha256()
-    probes = rows[:: max(1, len(rows) // 1000)]
-    for key in keys:
-        value = probes.get(key).cpu().contiguous()
-        digest.update(f"{key} {value.dtype} {tuple(value.shape)}".encode())
-        digest.update(value.flatten().view(torch.uint8).numpy().tobytes())
+    for key in keys if len(rows) else ():
+        column = rows.get(key)
+        digest.update(f"{key} {column.dtype} {tuple(column.shape)}".encode())
+        for block in column.split(BLOCK):
+            values = block.cpu().contiguous().flatten().view(torch.uint8)
+            digest.update(memoryview(values.numpy()))
     return digest.hexdigest()

@@ -16,13 +16,21 @@ import torch
 from tensordict import MemoryMappedTensor, TensorDict
 from tensordict.utils import NestedKey
 
+from torchrl_aca.offline.arguments import Bounds, bounds, score_range, size
 from torchrl_aca.offline.check import DatasetChecks
-from torchrl_aca.offline.dataset import OfflineDataset
+from torchrl_aca.offline.dataset import OfflineDataset, check_file
 from torchrl_aca.offline.errors import DatasetError
-from torchrl_aca.offline.layout import FORMAT, METADATA_FILE, dotted, file_name, row_layout, sha256
+from torchrl_aca.offline.layout import (
+    FORMAT,
+    METADATA_FILE,
+    dotted,
+    file_name,
+    row_bytes,
+    row_layout,
+    sha256,
+)
 
 VECTORS = ("observation", "action", ("next", "observation"))  # the others have one number a row
-Bounds = tuple[float | Sequence[float], float | Sequence[float]]
 
 
 class DatasetWriter:
@@ -44,7 +52,8 @@ class DatasetWriter:
         allow_constant: Which of "observation", "action" and "reward" may have columns that never
             vary. At least one column of observation and action has to vary in any case.
         check_continuity: Whether `finish` refuses episodes in which a next observation is not the
-            observation of the following row.
+            observation of the following row, and time limits that lead nowhere; see
+            `DatasetChecks`.
 
     Raises:
         DatasetError: If `path` exists, or an argument makes no sense.
@@ -66,9 +75,10 @@ class DatasetWriter:
                 f"{self.path} exists already; expected a new directory. Choose another path, or "
                 "delete it first."
             )
-        self.observation_dim, self.action_dim = observation_dim, action_dim
-        self.layout = row_layout(observation_dim, action_dim)
-        self.bounds = _bounds(action_bounds, action_dim)
+        self.observation_dim = size("observation_dim", observation_dim)
+        self.action_dim = size("action_dim", action_dim)
+        self.layout = row_layout(self.observation_dim, self.action_dim)
+        self.bounds = bounds(action_bounds, self.action_dim)
         self.checks = DatasetChecks(*self.bounds, allow_constant, check_continuity)
         self.staging = self.path.with_name(self.path.name + ".partial")
         self.returns: list[float] = []
@@ -79,8 +89,15 @@ class DatasetWriter:
         self._open = ExitStack()
 
     def __enter__(self) -> DatasetWriter:
-        if self.staging.is_dir():  # left by a writer that was killed
+        if self._files:
+            raise DatasetError("a writer writes one data set: make a new DatasetWriter.")
+        if self._owner.is_file():  # left by a writer that was killed
             shutil.rmtree(self.staging)
+        elif self.staging.exists():
+            raise DatasetError(
+                f"{self.staging} is in the way, and no writer has made it. Move it, or choose "
+                "another path."
+            )
         (self.staging / "next").mkdir(parents=True)
         self._owner.write_text(self._token)
         for key in self.layout:
@@ -142,7 +159,7 @@ class DatasetWriter:
         if not self._files:
             raise DatasetError("open the writer first: `with DatasetWriter(...) as writer:`.")
         rows = self._rows(given)
-        self.checks.add(rows)
+        self.checks.add(rows, complete)
         for key, file in self._files.items():
             file.write(rows[key].numpy().tobytes())
         if not complete:
@@ -175,7 +192,7 @@ class DatasetWriter:
                 nothing is at the path then.
         """
         self._require_staging()
-        scores, checked = _reference_scores(reference_scores), self.checks.finish()
+        scores, checked = score_range(reference_scores), self.checks.finish()
         self._sync()
         low, high = (bound.tolist() for bound in self.bounds)
         metadata = {
@@ -187,8 +204,8 @@ class DatasetWriter:
             "transitions": sum(self.lengths),
             "episodes": len(self.lengths),
             "incomplete_episodes": self.cut,
-            "returns": self._statistics(self.returns),
-            "lengths": self._statistics(self.lengths),
+            "returns": _statistics(self.complete(self.returns)),
+            "lengths": _statistics(self.complete(self.lengths)),
             "reference_scores": scores,
             "action_bounds": {"low": low, "high": high},
             **checked,
@@ -199,11 +216,20 @@ class DatasetWriter:
         }
         text = json.dumps(metadata, indent=2, default=str)
         (self.staging / METADATA_FILE).write_text(text + "\n")
-        OfflineDataset.load(self.staging)
         self._require_staging()
-        self._owner.unlink()
-        os.rename(self.staging, self.path)
+        try:
+            os.rename(self.staging, self.path)
+        except OSError as error:
+            raise DatasetError(
+                f"{self.path} cannot be made ({error}); nothing was kept. Choose another path."
+            ) from error
+        (self.path / self._owner.name).unlink()
         return OfflineDataset.load(self.path)
+
+    def complete(self, numbers: Sequence[float]) -> list[float]:
+        """Of one number per episode, those of episodes that the recording did not cut."""
+        cut = set(self.cut)
+        return [number for episode, number in enumerate(numbers) if episode not in cut]
 
     def _owns_staging(self) -> bool:
         """Whether the staging directory is still the one that this writer has made."""
@@ -237,6 +263,8 @@ class DatasetWriter:
             os.fsync(file.fileno())
         self._open.close()
         size = sum(self.lengths)
+        for key, (shape, dtype) in self.layout.items():  # mapping would fill up what is missing
+            check_file(self.staging / file_name(key), size * row_bytes(shape, dtype))
         mapped = {
             key: MemoryMappedTensor.from_filename(
                 self.staging / file_name(key), dtype=dtype, shape=(size, *shape)
@@ -246,19 +274,18 @@ class DatasetWriter:
         # The tensors lie where they belong already, so this only writes the meta.json files.
         TensorDict(mapped, batch_size=[size]).memmap(self.staging)
 
-    def _statistics(self, numbers: Sequence[float]) -> dict[str, float] | None:
-        """Returns mean, standard deviation (of the population) and range over whole episodes."""
-        cut = set(self.cut)
-        whole = [number for episode, number in enumerate(numbers) if episode not in cut]
-        if not whole:
-            return None
-        values = torch.tensor(whole, dtype=torch.float64)
-        return {
-            "mean": values.mean().item(),
-            "std": values.std(correction=0).item(),
-            "min": values.min().item(),
-            "max": values.max().item(),
-        }
+
+def _statistics(numbers: Sequence[float]) -> dict[str, float] | None:
+    """Returns mean, standard deviation (of the population) and range; None of nothing."""
+    if not numbers:
+        return None
+    values = torch.tensor(numbers, dtype=torch.float64)
+    return {
+        "mean": values.mean().item(),
+        "std": values.std(correction=0).item(),
+        "min": values.min().item(),
+        "max": values.max().item(),
+    }
 
 
 def _column(value: Any, shape: tuple[int, ...], dtype: torch.dtype, what: str) -> torch.Tensor:
@@ -268,23 +295,3 @@ def _column(value: Any, shape: tuple[int, ...], dtype: torch.dtype, what: str) -
     if dtype is torch.bool and tensor.dtype is not torch.bool:
         raise DatasetError(f"{what} has dtype {tensor.dtype}; expected booleans.")
     return tensor.to(dtype)
-
-
-def _bounds(bounds: Bounds, action_dim: int) -> tuple[torch.Tensor, torch.Tensor]:
-    low, high = (torch.as_tensor(bound, dtype=torch.float32) for bound in bounds)
-    if low.shape not in ((), (action_dim,)) or high.shape not in ((), (action_dim,)):
-        raise DatasetError(
-            f"action_bounds={bounds}: expected two numbers, or two lists of {action_dim} numbers."
-        )
-    if not (low.isfinite() & high.isfinite() & (low < high)).all():
-        raise DatasetError(f"action_bounds={bounds}: expected finite numbers with low < high.")
-    return low.expand(action_dim).clone(), high.expand(action_dim).clone()
-
-
-def _reference_scores(scores: tuple[float, float] | None) -> dict[str, float] | None:
-    if scores is None:
-        return None
-    low, high = map(float, scores)
-    if not low < high:
-        raise DatasetError(f"reference_scores={scores}: expected (low, high) with low < high.")
-    return {"min": low, "max": high}

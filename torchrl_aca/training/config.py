@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -51,19 +52,18 @@ def validate(cfg: DictConfig, algorithms: Iterable[str]) -> None:
     counts, rates = _counts_and_rates(cfg)
     for key in (*POSITIVE_INTEGERS, *counts):
         value = OmegaConf.select(cfg, key)
-        require(isinstance(value, int) and value > 0, cfg, key, "a positive integer")
+        require(is_count(value), cfg, key, "a positive integer")
     for key, (low, high) in {**RANGES, **dict.fromkeys(rates, (0, float("inf")))}.items():
         value = OmegaConf.select(cfg, key)
-        fits = isinstance(value, int | float) and low < value <= high
+        fits = is_number(value) and low < value <= high
         require(fits, cfg, key, f"a number above {low}, at most {high}")
     stop = cfg.eval.stop_return
-    require(stop is None or isinstance(stop, int | float), cfg, "eval.stop_return", "a number")
-    if cfg.num_threads is not None:
-        fits = isinstance(cfg.num_threads, int) and cfg.num_threads > 0
-        require(fits, cfg, "num_threads", "a positive integer or null")
+    require(stop is None or is_number(stop), cfg, "eval.stop_return", "a number")
+    fits = cfg.num_threads is None or is_count(cfg.num_threads)
+    require(fits, cfg, "num_threads", "a positive integer or null")
     for name, section in cfg.items():
         if isinstance(section, DictConfig) and "num_cells" in section:
-            fits = all(isinstance(cells, int) and cells > 0 for cells in section.num_cells)
+            fits = all(map(is_count, section.num_cells))
             require(fits, cfg, f"{name}.num_cells", "positive integers, one per hidden layer")
     _validate_sizes(cfg)
     _validate_seeds(cfg)
@@ -86,7 +86,7 @@ def _counts_and_rates(cfg: DictConfig) -> tuple[list[str], list[str]]:
 def _validate_seeds(cfg: DictConfig) -> None:
     for key in ("seed", "eval.seed"):
         value = OmegaConf.select(cfg, key)
-        fits = isinstance(value, int) and value >= 0
+        fits = value == 0 or is_count(value)
         require(fits, cfg, key, "an integer of at least 0")
     first, last = cfg.seed, cfg.seed + cfg.collector.num_envs - 1
     apart = cfg.eval.seed > last or cfg.eval.seed + cfg.eval.episodes <= first
@@ -111,6 +111,16 @@ def _validate_sizes(cfg: DictConfig) -> None:
         "collector.init_random_frames",
         f"a multiple of collector.frames_per_batch ({frames})",
     )
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value is a finite number; true and false are none."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def is_count(value: Any) -> bool:
+    """Whether a value is a positive integer."""
+    return is_number(value) and isinstance(value, int) and value > 0
 
 
 def require(condition: bool, cfg: DictConfig, key: str, expected: str) -> None:

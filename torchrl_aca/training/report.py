@@ -8,6 +8,7 @@ import subprocess
 from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import torch
@@ -107,14 +108,15 @@ def plot_curve(run_dir: Path, title: str, evaluations: Sequence[Mapping[str, Any
     figure.savefig(run_dir / "curve.png", dpi=120)
 
 
-def plot_returns(path: Path, returns: torch.Tensor, title: str) -> None:
-    """Draws the distribution of the returns of a data set's episodes, shape (episodes,)."""
+def plot_returns(path: Path, returns: Sequence[float], title: str) -> None:
+    """Draws the distribution of the returns of a data set's whole episodes."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(6, 4), layout="constrained")
     axes = figure.subplots()
-    axes.hist(returns.tolist(), bins=50)
-    axes.axvline(returns.mean().item(), color="black", linestyle="--", label="mean")
+    axes.hist(returns, bins=50)
+    if returns:
+        axes.axvline(fmean(returns), color="black", linestyle="--", label="mean")
+        axes.legend()
     axes.set(title=title, xlabel="return of an episode", ylabel="episodes")
-    axes.legend()
     figure.savefig(path, dpi=120)

@@ -10,6 +10,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from filelock import FileLock, Timeout
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 
@@ -42,6 +43,23 @@ def make_run_dir(cfg: DictConfig) -> Path:
     return run_dir
 
 
+def lock(run_dir: Path) -> FileLock:
+    """Takes a run directory for this process; the system gives it back when the process ends.
+
+    Raises:
+        RunError: If another process has it.
+    """
+    found = FileLock(run_dir / "at_work")
+    try:
+        found.acquire(blocking=False)
+    except Timeout:
+        raise RunError(
+            f"{run_dir}: another process is at work on this run. Wait for its end, or stop it with "
+            "Ctrl-C first: it leaves a checkpoint."
+        ) from None
+    return found
+
+
 def has_reached(evaluations: Sequence[Mapping[str, Any]], stop_return: float | None) -> bool:
     """Tells whether the latest two evaluations have averaged `stop_return`."""
     latest = [float(row["return_mean"]) for row in evaluations[-2:]]
@@ -49,7 +67,7 @@ def has_reached(evaluations: Sequence[Mapping[str, Any]], stop_return: float | N
 
 
 class Run:
-    """Keeps the books of a training loop; a context manager.
+    """Keeps the books of a training loop; a context manager. One process at a time has a directory.
 
     Attributes:
         dir: The run directory.
@@ -75,8 +93,12 @@ class Run:
             resumed: Whether the parts come from a checkpoint.
             script: The recipe that can go on with the run.
             facts: More rows for the card.
+
+        Raises:
+            RunError: If a new run's directory holds a run, or another process is at work in it.
         """
         self.dir = Path(cfg.resume) if resumed else make_run_dir(cfg)
+        self._lock = lock(self.dir)
         # The run as it is now: a resume may have changed the number of updates or the logger.
         self.config = {**OmegaConf.to_container(cfg, resolve=True), "resume": None}
         (self.dir / "config.yaml").write_text(OmegaConf.to_yaml(self.config))
@@ -101,6 +123,8 @@ class Run:
         self._signal.__exit__(*exc_info)
         self.bar.close()
         self.logger.close()
+        self._lock.release()
+        Path(self._lock.lock_file).unlink(missing_ok=True)
 
     @property
     def stopping(self) -> bool:
