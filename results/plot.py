@@ -1,57 +1,143 @@
-"""Evaluation returns of several runs in one figure.
+"""Evaluation returns of several runs: one figure, and the same numbers as a table.
 
-    python results/plot.py results/quickstart/curve.png results/quickstart/seed* --line random=-280
+    python results/plot.py results/quickstart/curve.png results/quickstart/seed* --line random=5
 
-Needs the `recipes` extra. Reads config.yaml and eval.csv of each run directory.
+Runs that differ in nothing but their seed are one curve: the mean over seeds, and each seed thin.
+A curve of a single run has a band of one standard deviation over episodes. The table is printed in
+Markdown. Needs the `recipes` extra; reads config.yaml and eval.csv of each run directory.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
+from statistics import mean
+from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from omegaconf import OmegaConf
 
+OWN_KEYS = ("seed", "run_dir", "resume", "logger", "checkpoint", "video")  # not what a run is
 
-def plot_run(axes: Axes, run_dir: Path) -> float:
-    """Draws mean +- std over episodes against updates; returns the frames of an update."""
-    config = OmegaConf.load(run_dir / "config.yaml")
-    with open(run_dir / "eval.csv", newline="") as file:
-        rows = list(csv.DictReader(file))
-    updates, mean, std = (
-        [float(row[name]) for row in rows] for name in ("updates", "return_mean", "return_std")
-    )
-    label = f"{config.algo.name}, seed {config.seed}"
-    (line,) = axes.plot(updates, mean, marker="o", markersize=3, label=label)
-    low = [m - s for m, s in zip(mean, std, strict=True)]
-    high = [m + s for m, s in zip(mean, std, strict=True)]
+
+@dataclass(frozen=True)
+class Run:
+    """What a curve takes from a run directory."""
+
+    dir: Path
+    config: dict[str, Any]
+    evaluations: list[dict[str, float]]
+
+    @classmethod
+    def read(cls, run_dir: Path) -> Run:
+        config = OmegaConf.to_container(OmegaConf.load(run_dir / "config.yaml"))
+        with open(run_dir / "eval.csv", newline="") as file:
+            rows = [{k: float(v) for k, v in row.items()} for row in csv.DictReader(file)]
+        return cls(run_dir, config, rows)
+
+    @property
+    def settings(self) -> str:
+        """Everything but the seed and where the run was written, as comparable text."""
+        return str({k: v for k, v in sorted(self.config.items()) if k not in OWN_KEYS})
+
+    def column(self, name: str) -> list[float]:
+        return [row[name] for row in self.evaluations]
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Runs of equal settings, by seed."""
+
+    runs: list[Run]
+
+    @property
+    def label(self) -> str:
+        config, seeds = self.runs[0].config, [run.config["seed"] for run in self.runs]
+        without = ", no offline data" if config.get("offline_fraction") == 0 else ""
+        count = f"{len(seeds)} seeds" if len(seeds) > 1 else f"seed {seeds[0]}"
+        return f"{config['algo']['name']}{without}, {count}"
+
+    def at(self, updates: float) -> list[float]:
+        """The return of each run after so many updates; none where there was no evaluation."""
+        pairs = [zip(r.column("updates"), r.column("return_mean"), strict=True) for r in self.runs]
+        return [value for run in pairs for when, value in run if when == updates]
+
+    def shared(self) -> list[float]:
+        """The updates at which all runs were evaluated."""
+        return [u for u in self.runs[0].column("updates") if len(self.at(u)) == len(self.runs)]
+
+
+def make_curves(run_dirs: Sequence[Path]) -> list[Curve]:
+    """The curves of run directories, in the order in which they are first named."""
+    runs = [Run.read(run_dir) for run_dir in run_dirs]
+    order = [run.settings for run in runs]
+    runs.sort(key=lambda run: (order.index(run.settings), run.config["seed"]))
+    return [Curve(list(group)) for _, group in groupby(runs, key=lambda run: run.settings)]
+
+
+def draw(axes: Axes, curve: Curve) -> None:
+    """Adds a curve to a figure."""
+    updates = curve.shared()
+    values = [mean(curve.at(u)) for u in updates]
+    (line,) = axes.plot(updates, values, marker="o", markersize=3, label=curve.label)
+    if len(curve.runs) > 1:
+        for run in curve.runs:
+            thin = {"color": line.get_color(), "alpha": 0.4, "linewidth": 1}
+            axes.plot(run.column("updates"), run.column("return_mean"), **thin)
+        return
+    pairs = list(zip(values, curve.runs[0].column("return_std"), strict=True))
+    low, high = [m - s for m, s in pairs], [m + s for m, s in pairs]
     axes.fill_between(updates, low, high, alpha=0.15, color=line.get_color(), linewidth=0)
-    axes.set_title(config.env.name)
-    return 1 / config.optim.utd_ratio
+
+
+def frames_per_update(curves: Sequence[Curve]) -> str:
+    """How many environment frames an update is, as text."""
+    rates = sorted({1 / curve.runs[0].config["optim"]["utd_ratio"] for curve in curves})
+    return " or ".join(f"{rate:g}" for rate in rates)
+
+
+def table(curves: Sequence[Curve]) -> str:
+    """The means over seeds at each evaluation, with the seeds' own in brackets, in Markdown."""
+    lines = ["| " + " | ".join(["updates", *(curve.label for curve in curves)]) + " |"]
+    lines.append("|" + "--:|" * (len(curves) + 1))
+    for updates in sorted({u for curve in curves for u in curve.shared()}):
+        cells = [f"{updates:,.0f}"]
+        for curve in curves:
+            each = curve.at(updates)
+            seeds = f" ({', '.join(f'{value:.0f}' for value in each)})" if len(each) > 1 else ""
+            cells.append(f"{mean(each):.0f}{seeds}" if len(each) == len(curve.runs) else "")
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
 
 
 def main() -> None:
-    """Parses the command line and writes the figure."""
+    """Parses the command line, writes the figure and prints the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("output", type=Path)
     parser.add_argument("run_dirs", type=Path, nargs="+")
     parser.add_argument("--line", action="append", default=[], help="NAME=RETURN, drawn dashed")
     arguments = parser.parse_args()
 
+    curves = make_curves(arguments.run_dirs)
     figure = Figure(figsize=(6.4, 4), layout="constrained")
     axes = figure.subplots()
-    frames_per_update = {plot_run(axes, run_dir) for run_dir in arguments.run_dirs}
+    for curve in curves:
+        draw(axes, curve)
     for text in arguments.line:
         name, value = text.split("=")
         axes.axhline(float(value), color="0.4", linestyle="--", linewidth=1, label=name)
-    unit = " or ".join(f"{frames:g}" for frames in sorted(frames_per_update))
-    axes.set(xlabel=f"updates ({unit} env frames each)", ylabel="evaluation return")
+    unit = f"updates ({frames_per_update(curves)} env frames each)"
+    title = ", ".join(sorted({curve.runs[0].config["env"]["name"] for curve in curves}))
+    axes.set(title=title, xlabel=unit, ylabel="evaluation return")
     axes.grid(alpha=0.3)
     axes.legend(frameon=False)
     figure.savefig(arguments.output, dpi=150)
+    print(table(curves))
 
 
 if __name__ == "__main__":

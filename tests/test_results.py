@@ -1,0 +1,80 @@
+"""Promises of results/plot.py and of the tables in results/README.md that it printed."""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+RESULTS = Path(__file__).parents[1] / "results"
+PLOTS = re.findall(
+    r"`python (results/plot\.py results/[^`]+)`", (RESULTS / "README.md").read_text()
+)
+
+
+@pytest.fixture(scope="module")
+def plot():
+    spec = importlib.util.spec_from_file_location("plot", RESULTS / "plot.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # where dataclasses look themselves up
+    spec.loader.exec_module(module)
+    yield module
+    del sys.modules[spec.name]
+
+
+def write_run(path: Path, returns: dict[int, float], seed: int = 0, **settings) -> Path:
+    config = {"algo": {"name": "aca"}, "env": {"name": "Task-v1"}, "optim": {"utd_ratio": 1}}
+    path.mkdir()
+    OmegaConf.save(config | {"seed": seed, "run_dir": str(path)} | settings, path / "config.yaml")
+    with open(path / "eval.csv", "w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["updates", "return_mean", "return_std"])
+        writer.writerows([updates, value, 1.0] for updates, value in returns.items())
+    return path
+
+
+def test_seeds_of_equal_settings_are_one_curve(plot, tmp_path):
+    first = write_run(tmp_path / "b", {0: 1.0, 10: 30.0}, seed=2)
+    second = write_run(tmp_path / "a", {0: 3.0, 10: 10.0, 20: 5.0}, seed=1)
+    (curve,) = plot.make_curves([first, second])
+    assert curve.label == "aca, 2 seeds"
+    assert plot.table([curve]).splitlines()[2:] == ["| 0 | 2 (3, 1) |", "| 10 | 20 (10, 30) |"]
+
+
+def test_other_settings_are_another_curve(plot, tmp_path):
+    plain = write_run(tmp_path / "a", {0: 1.0, 1000: 4.4})
+    control = write_run(tmp_path / "b", {0: 2.0}, offline_fraction=0)
+    curves = plot.make_curves([control, plain])
+    assert plot.table(curves).splitlines() == [
+        "| updates | aca, no offline data, seed 0 | aca, seed 0 |",
+        "|--:|--:|--:|",
+        "| 0 | 2 | 1 |",
+        "| 1,000 |  | 4 |",
+    ]
+
+
+def test_command_draws_curves_and_lines(tmp_path):
+    runs = [write_run(tmp_path / f"{s}", {0: 1.0, 10: 2.0 + s}, seed=s) for s in (0, 1)]
+    script, figure = str(RESULTS / "plot.py"), tmp_path / "curve.svg"
+    typed = [sys.executable, script, str(figure), *map(str, runs), "--line", "mean of the data=3"]
+    printed = subprocess.run(typed, capture_output=True, text=True, check=True).stdout
+    assert "| 10 | 2 (2, 3) |" in printed
+    assert figure.read_text().count('id="line2d_') > 5  # the curve, its seeds, the line, the axes
+
+
+@pytest.mark.parametrize("command", PLOTS)
+def test_tables_in_the_readme_are_what_the_command_prints(plot, command):
+    _, _, *arguments = shlex.split(command)
+    named = [a for a in arguments if a.startswith("results/")]
+    run_dirs = [path for name in named for path in sorted(RESULTS.parent.glob(name))]
+    rows = plot.table(plot.make_curves(run_dirs)).splitlines()[2:]
+    assert rows
+    text = (RESULTS / "README.md").read_text()
+    assert [row for row in rows if row not in text] == []
