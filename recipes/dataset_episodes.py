@@ -133,6 +133,7 @@ def finished_sac_run(cfg: DictConfig, run_dir: Path) -> Path:
     else:
         stored = OmegaConf.load(run_dir / "config.yaml")
         require_equal(wanted, stored, wanted, "the SAC run's configuration")
+        typed += ["eval.stop_return", "optim.total_updates"]  # where it ends is this command's say
         apply_overrides(stored, wanted, typed)
         if not is_finished(run_dir, stored):
             wanted.resume = str(run_dir)

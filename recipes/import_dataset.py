@@ -22,7 +22,9 @@ def import_dataset(cfg: DictConfig) -> OfflineDataset:
     Raises:
         DatasetError: If a key is missing or the import fails.
     """
-    if missing := sorted(OmegaConf.missing_keys(cfg)):
+    needed = ("format", "path", "source")
+    missing = [key for key in needed if OmegaConf.is_missing(cfg, key) or cfg[key] is None]
+    if missing:
         raise DatasetError(f"expected values for {missing}: set them with {missing[0]}=... .")
     if cfg.format not in IMPORTERS:
         raise DatasetError(f"format={cfg.format}: expected one of {list(IMPORTERS)}.")

@@ -33,7 +33,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_aca.offline import DatasetError, DatasetWriter, OfflineDataset, reference_scores
 from torchrl_aca.offline.registry import ROOT
-from torchrl_aca.training.config import require
+from torchrl_aca.training.config import is_count, require
 from torchrl_aca.training.envs import make_env
 from torchrl_aca.training.errors import RunError
 from torchrl_aca.training.report import plot_returns, versions
@@ -66,16 +66,19 @@ def make_dataset(cfg: DictConfig) -> OfflineDataset:
     ) as writer:
         for episode in episodes_of(cfg, env, source):
             writer.add_episode(**episode)
+        name, returns = (
+            f"{task} {cfg.tier} (D4RL-style, locally generated)",
+            writer.complete(writer.returns),
+        )
         if cfg.check:
-            check_returns(cfg, writer.complete(writer.returns))
-        dataset = writer.finish(
-            name=f"{task} {cfg.tier} (D4RL-style, locally generated)",
+            check_returns(cfg, returns)
+        plot_returns(writer.staging / "returns.png", returns, name)
+        return writer.finish(
+            name=name,
             env_id=cfg.env.name,
             reference_scores=reference_scores(cfg.env.name),
             provenance=provenance(cfg, source),
         )
-    plot_returns(path / "returns.png", writer.complete(writer.returns), dataset.metadata["name"])
-    return dataset
 
 
 def task_name(env_id: str) -> str:
@@ -90,8 +93,7 @@ def validate(cfg: DictConfig) -> None:
         raise RunError(f"tier={tier}: expected one of {list(TIERS)}. Set it with tier=... .")
     for key, least in (("episodes", 1), ("seed", 0), ("sac.seed", 0)):
         value = OmegaConf.select(cfg, key)
-        fits = isinstance(value, int) and value >= least
-        require(fits, cfg, key, f"an integer of at least {least}")
+        require(is_count(value, least), cfg, key, f"an integer of at least {least}")
 
 
 def episodes_of(cfg: DictConfig, env: gym.Env, source: Path | None) -> Iterator[Episode]:
@@ -142,7 +144,10 @@ def main(cfg: DictConfig) -> None:
     except (DatasetError, RunError) as error:
         raise SystemExit(f"error: {error}") from None
     except KeyboardInterrupt:
-        raise SystemExit("stopped: no data set was made. The same command begins anew.") from None
+        raise SystemExit(
+            "stopped: no data set was made. The same command makes it; a SAC run goes on from its "
+            "newest checkpoint."
+        ) from None
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ from offline_data import (
     load_offline_data,
     make_mixture,
     offline_facts,
-    score_range,
+    task_scores,
 )
 from omegaconf import DictConfig, OmegaConf
 from online_mujoco import make_agent, make_collector, make_device, report_extras, updates_due
@@ -54,7 +54,7 @@ def train(cfg: DictConfig, checkpoint: dict[str, Any] | None = None) -> Path:
     eval_env = make_vector_env(cfg.env.name, cfg.eval.episodes, cfg.eval.seed)
     agent = make_agent(cfg, env, device)
     dataset = load_offline_data(cfg, env)
-    scores = score_range(cfg, dataset)
+    scores = task_scores(cfg)
     buffer = make_mixture(cfg, dataset)
     episodes, means, counters = EpisodeTracker(cfg.collector.num_envs), MetricMeans(), Counters()
     parts = {

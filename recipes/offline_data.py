@@ -68,8 +68,10 @@ def generate_missing(cfg: DictConfig) -> None:
     recipe.path = str(dataset_path(cfg))
     print(f"generating {recipe.path}", flush=True)
     threads = torch.get_num_threads()
-    make_dataset(recipe)
-    torch.set_num_threads(threads)  # the SAC run behind some data sets its own
+    try:
+        make_dataset(recipe)
+    finally:
+        torch.set_num_threads(threads)  # the SAC run behind some data has its own number
 
 
 def load_offline_data(cfg: DictConfig, env: EnvBase) -> OfflineDataset | None:
@@ -111,10 +113,15 @@ def require_fit(cfg: DictConfig, metadata: Mapping[str, Any], env: EnvBase) -> N
         )
 
 
-def score_range(cfg: DictConfig, dataset: OfflineDataset | None) -> Scores | None:
-    """The returns that count as 0 and 100: the data set's, or else those known for the task."""
-    if dataset is not None and (own := dataset.metadata["reference_scores"]):
-        return own["min"], own["max"]
+def task_scores(cfg: DictConfig) -> Scores | None:
+    """The returns that count as 0 and 100: the data set's, or else those known for the task.
+
+    A data set may be named without taking rows from it, so that a control has the same scale.
+    """
+    if cfg.dataset is not None and dataset_path(cfg).is_dir():
+        own = OfflineDataset.load(dataset_path(cfg)).metadata["reference_scores"]
+        if own is not None:
+            return own["min"], own["max"]
     return reference_scores(cfg.env.name)
 
 

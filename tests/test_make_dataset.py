@@ -198,6 +198,9 @@ def test_the_run_stops_when_two_evaluations_have_averaged_the_return(generate, t
     evaluated = rows_of(tmp_path / "sac" / "eval.csv")
     assert [row["updates"] for row in evaluated] == ["0", "20"]
     assert len(dataset.data) == 100 + 20
+    generate("medium", tmp_path)  # asks for the whole run, so it goes on
+    evaluated = rows_of(tmp_path / "sac" / "eval.csv")
+    assert [row["updates"] for row in evaluated] == ["0", "20", "40"]
 
 
 def test_an_interrupted_run_goes_on_with_the_same_command(generate, folder, recipes, tmp_path):

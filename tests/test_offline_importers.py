@@ -127,6 +127,13 @@ def test_flags_may_be_numbers_as_some_files_have_them(source, tmp_path):
     assert (import_d4rl(other, tmp_path / "other", progress=False).data == first.data).all()
 
 
+def test_the_byte_order_of_a_file_does_not_matter(source, tmp_path):
+    swapped = {name: joined(EPISODES, NAMES[name]).astype(">f4") for name in ("actions", "rewards")}
+    other = write_d4rl(tmp_path / "swapped.hdf5", **swapped)
+    first = import_d4rl(source, tmp_path / "first", progress=False)
+    assert (import_d4rl(other, tmp_path / "other", progress=False).data == first.data).all()
+
+
 def test_other_reference_scores_and_other_bounds_can_be_given(source, tmp_path):
     options = {"reference_scores": (0, 10), "action_bounds": (-2, 2), "progress": False}
     dataset = import_d4rl(source, tmp_path / "data", env_id="HalfCheetah-v2", **options)
@@ -211,9 +218,12 @@ def test_damage_anywhere_is_told_in_one_message(source, tmp_path, damage):
     content[start : start + 24] = bytes(24)
     source.write_bytes(content)
     try:
-        import_d4rl(source, tmp_path / "data", progress=False)
+        damaged = import_d4rl(source, tmp_path / "data", progress=False)
     except DatasetError:
         assert list(tmp_path.iterdir()) == [source]
+    else:  # it was of no consequence
+        whole = import_d4rl(write_d4rl(tmp_path / "whole.hdf5"), tmp_path / "whole", progress=False)
+        assert (damaged.data == whole.data).all()
 
 
 def test_a_link_that_leads_nowhere_is_named(source, tmp_path):
@@ -224,11 +234,15 @@ def test_a_link_that_leads_nowhere_is_named(source, tmp_path):
         import_d4rl(source, tmp_path / "data", progress=False)
 
 
-def test_wrong_reference_scores_are_told_before_the_work(tmp_path):
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_wrong_reference_scores_are_told_before_the_work(source, tmp_path, monkeypatch):
+    monkeypatch.delattr(DatasetWriter, "add_episode")  # the work
+    sources = {import_d4rl: source, import_minari: make_minari(tmp_path / "minari", monkeypatch)}
     for importer in (import_d4rl, import_minari):
-        for scores in (5, (1,), ("a", "b"), (2, 1)):
+        source = sources[importer]
+        for scores in (5, (1,), ("a", "b"), (2, 1), (0, np.inf)):
             with pytest.raises(DatasetError, match="reference_scores=.*expected .low, high."):
-                importer(tmp_path / "none", tmp_path / "data", reference_scores=scores)
+                importer(source, tmp_path / "data", reference_scores=scores)
 
 
 @pytest.mark.slow
@@ -409,5 +423,7 @@ def test_recipe_takes_the_bounds_of_minari(recipe, tmp_path, monkeypatch):
 def test_recipe_names_what_is_missing(recipe, source):
     with pytest.raises(DatasetError, match=r"values for \['format', 'path'\]"):
         recipe.import_dataset(configured(f"source={source}"))
+    with pytest.raises(DatasetError, match=r"values for \['path'\]"):
+        recipe.import_dataset(configured(f"source={source}", "path=null", "format=d4rl"))
     with pytest.raises(DatasetError, match="format=csv: expected one of"):
         recipe.import_dataset(configured(f"source={source}", "path=x", "format=csv"))

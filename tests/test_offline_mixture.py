@@ -305,6 +305,9 @@ def test_returns_over_several_steps_are_not_mixed_with_single_steps():
         ValueError, match="'steps_to_next_obs', so its rewards are sums over several"
     ):
         mixture().extend(several)
+    single = [key for key in several.keys(True, True) if key != "steps_to_next_obs"]
+    with pytest.raises(ValueError, match="The offline half has 'steps_to_next_obs'"):
+        MixedReplayBuffer(several, online_buffer(), keys=single)
     both = MixedReplayBuffer(several, online_buffer())
     both.extend(several)
     assert (both.sample(8)["steps_to_next_obs"] == 3).all()

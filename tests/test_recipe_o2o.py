@@ -271,10 +271,12 @@ def test_generating_data_leaves_the_number_of_threads(recipes, tmp_path, monkeyp
 
 def test_scores_are_those_of_the_data_set(train, tmp_path):
     path = record(tmp_path / "noise", reference_scores=(-50.0, 150.0))
-    run_dir = train(*settings(path, tmp_path / "here"), "optim.total_updates=2")
-    for row in rows_of(run_dir / "eval.csv"):
-        expected = (float(row["return_mean"]) + 50) / 2
-        assert float(row["normalized_score"]) == pytest.approx(expected)
+    for fraction in (0.5, 0):  # with its rows, and a control without them
+        typed = ["optim.total_updates=2", f"offline_fraction={fraction}"]
+        run_dir = train(*settings(path, tmp_path / f"{fraction}"), *typed)
+        for row in rows_of(run_dir / "eval.csv"):
+            expected = (float(row["return_mean"]) + 50) / 2
+            assert float(row["normalized_score"]) == pytest.approx(expected)
 
 
 def test_the_quickstart_makes_its_data_and_is_short():

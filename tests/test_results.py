@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
 from omegaconf import OmegaConf
 
 RESULTS = Path(__file__).parents[1] / "results"
@@ -60,13 +61,34 @@ def test_other_settings_are_another_curve(plot, tmp_path):
     ]
 
 
-def test_command_draws_curves_and_lines(tmp_path):
+def test_curves_of_one_label_are_told_apart_and_a_run_counts_once(plot, tmp_path):
+    few = write_run(tmp_path / "few", {0: 1.0}, aca={"num_steps": 5})
+    many = write_run(tmp_path / "many", {0: 2.0}, aca={"num_steps": 10})
+    header = plot.table(plot.make_curves([few, many])).splitlines()[0]
+    assert header == "| updates | aca, seed 0 (few) | aca, seed 0 (many) |"
+    with pytest.raises(SystemExit, match="equal settings and seeds"):
+        plot.make_curves([few, few])
+
+
+def test_a_curve_is_its_mean_and_each_seed(plot, tmp_path):
+    runs = [write_run(tmp_path / f"{s}", {0: 1.0, 10: 2.0 + s}, seed=s) for s in (0, 1)]
+    axes = Figure().subplots()
+    plot.draw(axes, *plot.make_curves(runs), "both")
+    drawn = [line.get_ydata().tolist() for line in axes.lines]
+    assert drawn == [[1.0, 2.5], [1.0, 2.0], [1.0, 3.0]]
+
+
+def test_command_writes_the_figure_and_prints_the_table(tmp_path):
     runs = [write_run(tmp_path / f"{s}", {0: 1.0, 10: 2.0 + s}, seed=s) for s in (0, 1)]
     script, figure = str(RESULTS / "plot.py"), tmp_path / "curve.svg"
     typed = [sys.executable, script, str(figure), *map(str, runs), "--line", "mean of the data=3"]
     printed = subprocess.run(typed, capture_output=True, text=True, check=True).stdout
     assert "| 10 | 2 (2, 3) |" in printed
-    assert figure.read_text().count('id="line2d_') > 5  # the curve, its seeds, the line, the axes
+    assert "<!-- mean of the data -->" in figure.read_text()
+
+
+def test_the_readme_has_tables_that_a_command_prints():
+    assert len(PLOTS) == 2
 
 
 @pytest.mark.parametrize("command", PLOTS)

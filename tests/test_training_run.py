@@ -216,12 +216,18 @@ def test_one_evaluation_or_no_return_to_reach_never_stops_a_run():
 def test_a_run_belongs_to_one_process_until_it_ends(tmp_path):
     cfg, counters = settings(tmp_path), Counters(frames=1)
     cfg.resume = str(tmp_path / "run")
-    first = Run(settings(tmp_path), {"counters": counters}, counters, False, "recipe.py")
-    with first, pytest.raises(RunError, match="run: another process is at work on this run"):
-        Run(cfg, {"counters": counters}, counters, True, "recipe.py")
-    assert not (tmp_path / "run" / "at_work").exists()
+    with Run(settings(tmp_path), {"counters": counters}, counters, False, "recipe.py") as first:
+        first.save()
+        with pytest.raises(RunError, match="run: another process is at work on this run"):
+            Run(cfg, {"counters": counters}, counters, True, "recipe.py")
     with Run(cfg, {"counters": counters}, counters, True, "recipe.py") as run:
         assert run.dir == tmp_path / "run"
+        counters.updates = 5
+        run.save()
+    with pytest.raises(RunError, match=r"went on to .*0005.pt while its checkpoint of 0 updates"):
+        Run(cfg, {}, Counters(), True, "recipe.py")
+    with Run(cfg, {}, counters, True, "recipe.py"):
+        pass  # the refusal has let go of the directory
 
 
 def test_a_stopped_run_names_the_recipe_that_goes_on_with_it(tmp_path, capsys):

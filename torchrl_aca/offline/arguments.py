@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Sequence
 from typing import Any
@@ -49,6 +50,8 @@ def score_range(scores: tuple[float, float] | None) -> dict[str, float] | None:
         low, high = map(float, scores)
     except (TypeError, ValueError):
         low = high = 0.0
-    if not low < high:
-        raise DatasetError(f"reference_scores={scores!r}: expected (low, high) with low < high.")
+    if not -math.inf < low < high < math.inf:
+        raise DatasetError(
+            f"reference_scores={scores!r}: expected (low, high), finite and with low < high."
+        )
     return {"min": low, "max": high}

@@ -48,7 +48,7 @@ class DatasetChecks:
         check_continuity: bool = True,
     ) -> None:
         names = allow_constant if isinstance(allow_constant, Collection) else [allow_constant]
-        if isinstance(names, str) or not set(names) <= VARYING.keys():
+        if isinstance(names, str) or not all(name in list(VARYING) for name in names):
             raise DatasetError(
                 f"allow_constant={allow_constant!r}: expected a collection of some of "
                 f"{list(VARYING)}, such as ('observation',)."

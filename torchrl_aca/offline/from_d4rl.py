@@ -62,7 +62,8 @@ def import_d4rl(
     """
     import h5py
 
-    score_range(reference_scores)  # before the work
+    scores = known_scores(env_id) if reference_scores is None else reference_scores
+    score_range(scores)  # before the work
     source = Path(source)
     if not source.is_file() or not h5py.is_hdf5(source):
         state = "is no HDF5 file" if source.is_file() else "does not exist"
@@ -79,7 +80,7 @@ def import_d4rl(
             return writer.finish(
                 name=name or source.stem,
                 env_id=env_id,
-                reference_scores=reference_scores or known_scores(env_id),
+                reference_scores=scores,
                 provenance={
                     **provenance_of("import_d4rl", source.name, source, "h5py"),
                     "dropped_rows": size - sum(writer.lengths),
@@ -99,7 +100,8 @@ def _columns(file: Any, source: Path) -> dict[str, Any]:
     columns = {name: file[name] for name in names}
     for name, column in columns.items():
         rank = RANKS.get(name, 2)
-        if len(getattr(column, "shape", None) or ()) != rank or column.dtype.kind not in "biuf":
+        fits = len(getattr(column, "shape", None) or ()) == rank
+        if not fits or column.dtype.kind not in "biuf" or column.dtype.itemsize > 8:
             expected = "(rows, columns)" if rank == 2 else "(rows,)"
             raise DatasetError(
                 f"{source}: {name!r} is {column}; expected an array of numbers of shape {expected}."
@@ -135,7 +137,7 @@ def _episodes(columns: Mapping[str, Any], source: Path) -> Iterator[dict[str, An
             if stop > block_stop:
                 block_start, block_stop = start, min(max(stop, start + BLOCK), size)
                 block = {
-                    name: torch.as_tensor(column[block_start:block_stop])
+                    name: _tensor(column[block_start:block_stop])
                     for name, column in columns.items()
                 }
             rows = slice(start - block_start, stop - block_start)
@@ -143,6 +145,11 @@ def _episodes(columns: Mapping[str, Any], source: Path) -> Iterator[dict[str, An
             if len(episode["reward"]):
                 yield episode
             start = stop
+
+
+def _tensor(values: Any) -> torch.Tensor:
+    """Numbers in the byte order of this machine, whatever that of the file is."""
+    return torch.as_tensor(values.astype(values.dtype.newbyteorder("=")))
 
 
 def _flags(columns: Mapping[str, Any], name: str, source: Path) -> Any:

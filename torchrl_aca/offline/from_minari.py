@@ -47,7 +47,6 @@ def import_minari(
         DatasetError: If there is no such data set, it cannot be read to its end, its spaces are no
             vectors, or the data fail a check. Nothing is at `path` then.
     """
-    score_range(reference_scores)  # before the work
     dataset = _open(source)
     observation_dim, action_dim = (
         _vector_length(space, kind, source)
@@ -57,15 +56,15 @@ def import_minari(
         )
     )
     options.setdefault("action_bounds", (dataset.action_space.low, dataset.action_space.high))
-    described = dataset.storage.metadata
-    scores = described.get("ref_min_score"), described.get("ref_max_score")
+    scores = _scores(dataset) if reference_scores is None else reference_scores
+    score_range(scores)  # before the work
     file = Path(dataset.storage.data_path) / "main_data.hdf5"
     with DatasetWriter(path, observation_dim, action_dim, **options) as writer:
         write_episodes(writer, _episodes(dataset, source), dataset.total_steps, progress)
         return writer.finish(
             name=name or dataset.id,
             env_id=env_id or (dataset.env_spec and dataset.env_spec.id),
-            reference_scores=reference_scores or (None if None in scores else scores),
+            reference_scores=scores,
             provenance=provenance_of("import_minari", dataset.id, file, "minari"),
         )
 
@@ -86,6 +85,12 @@ def _open(source: str | Path) -> Any:
             f"{source} is no Minari data set on this machine ({reason}); expected an id that "
             "`minari list local` shows, or the directory of a data set, which has `data/` in it."
         ) from error
+
+
+def _scores(dataset: Any) -> tuple[float, float] | None:
+    described = dataset.storage.metadata
+    low, high = described.get("ref_min_score"), described.get("ref_max_score")
+    return None if low is None or high is None else (low, high)
 
 
 def _vector_length(space: Any, kind: str, source: str | Path) -> int:

@@ -111,7 +111,7 @@ class MixedReplayBuffer:
         self.keys = [unravel_key(key) for key in keys]
         self._layout: Layout | None = None  # without offline data, the first online rows set it
         if offline is not None:
-            self._layout = layout_of(self._offline, self.keys, "The offline half")
+            self._check(self._offline, "The offline half")
         self._online_is_checked = False
         self._fingerprint = fingerprint(self._offline, self.keys)
         self._check_online()
@@ -185,7 +185,7 @@ class MixedReplayBuffer:
             self._online_is_checked = True
 
     def _check(self, rows: TensorDictBase, name: str) -> None:
-        if N_STEPS in rows.keys() - self.keys:
+        if N_STEPS not in self.keys and rows.get(N_STEPS, None) is not None:
             raise ValueError(
                 f"{name} has {N_STEPS!r}, so its rewards are sums over several steps, but the "
                 f"mixture's keys are {self.keys}. Give the offline half the same n-step return and "

@@ -98,8 +98,9 @@ class DatasetWriter:
                 f"{self.staging} is in the way, and no writer has made it. Move it, or choose "
                 "another path."
             )
-        (self.staging / "next").mkdir(parents=True)
+        self.staging.mkdir(parents=True)
         self._owner.write_text(self._token)
+        (self.staging / "next").mkdir()
         for key in self.layout:
             file = open(self.staging / file_name(key), "wb")  # noqa: SIM115
             self._files[key] = self._open.enter_context(file)

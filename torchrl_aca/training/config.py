@@ -86,8 +86,7 @@ def _counts_and_rates(cfg: DictConfig) -> tuple[list[str], list[str]]:
 def _validate_seeds(cfg: DictConfig) -> None:
     for key in ("seed", "eval.seed"):
         value = OmegaConf.select(cfg, key)
-        fits = value == 0 or is_count(value)
-        require(fits, cfg, key, "an integer of at least 0")
+        require(is_count(value, low=0), cfg, key, "an integer of at least 0")
     first, last = cfg.seed, cfg.seed + cfg.collector.num_envs - 1
     apart = cfg.eval.seed > last or cfg.eval.seed + cfg.eval.episodes <= first
     require(apart, cfg, "eval.seed", f"seeds apart from the training's {first} to {last}")
@@ -118,9 +117,9 @@ def is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def is_count(value: Any) -> bool:
-    """Whether a value is a positive integer."""
-    return is_number(value) and isinstance(value, int) and value > 0
+def is_count(value: Any, low: int = 1) -> bool:
+    """Whether a value is an integer of at least `low`."""
+    return is_number(value) and isinstance(value, int) and value >= low
 
 
 def require(condition: bool, cfg: DictConfig, key: str, expected: str) -> None:

@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 
 from torchrl_aca.training.agent import Stateful
-from torchrl_aca.training.checkpoint import Counters, save_checkpoint
+from torchrl_aca.training.checkpoint import Counters, list_checkpoints, save_checkpoint
 from torchrl_aca.training.data import check_finite
 from torchrl_aca.training.errors import RunError
 from torchrl_aca.training.logging import ProgressBar, RunLogger
@@ -25,7 +25,7 @@ Metrics = Mapping[str, float]
 
 
 def make_run_dir(cfg: DictConfig) -> Path:
-    """Creates the directory of a new run and writes versions.json.
+    """Creates the directory of a new run.
 
     Raises:
         RunError: If `run_dir` already holds a run.
@@ -39,17 +39,18 @@ def make_run_dir(cfg: DictConfig) -> Path:
             f"run_dir, or go on with resume={run_dir}."
         )
     run_dir.mkdir(parents=True, exist_ok=True)
-    (run_dir / "versions.json").write_text(json.dumps(versions(), indent=2) + "\n")
     return run_dir
 
 
 def lock(run_dir: Path) -> FileLock:
     """Takes a run directory for this process; the system gives it back when the process ends.
 
+    The file stays: to remove it would let two processes lock two files of one name.
+
     Raises:
         RunError: If another process has it.
     """
-    found = FileLock(run_dir / "at_work")
+    found = FileLock(run_dir / ".lock")
     try:
         found.acquire(blocking=False)
     except Timeout:
@@ -58,6 +59,16 @@ def lock(run_dir: Path) -> FileLock:
             "Ctrl-C first: it leaves a checkpoint."
         ) from None
     return found
+
+
+def require_newest(run_dir: Path, updates: int) -> None:
+    """Raises `RunError` if a checkpoint newer than the one just read has come meanwhile."""
+    newest = list_checkpoints(run_dir / "checkpoints")[-1]
+    if not newest.stem.endswith(f"_{updates:010d}"):
+        raise RunError(
+            f"{run_dir} went on to {newest.name} while its checkpoint of {updates} updates was "
+            "read. Resume it again."
+        )
 
 
 def has_reached(evaluations: Sequence[Mapping[str, Any]], stop_return: float | None) -> bool:
@@ -95,22 +106,37 @@ class Run:
             facts: More rows for the card.
 
         Raises:
-            RunError: If a new run's directory holds a run, or another process is at work in it.
+            RunError: If a new run's directory holds a run, another process is at work in it, or has
+                gone on with it since its checkpoint was read.
         """
         self.dir = Path(cfg.resume) if resumed else make_run_dir(cfg)
+        self.parts, self.counters, self.facts = parts, counters, facts or {}
+        self.script = script
         self._lock = lock(self.dir)
+        try:
+            self._open(cfg, resumed)
+        except BaseException:
+            self._lock.release()
+            raise
+
+    def _open(self, cfg: DictConfig, resumed: bool) -> None:
+        """Writes what describes the run, and opens its log."""
+        if resumed:
+            require_newest(self.dir, self.counters.updates)
+        else:
+            text = json.dumps(versions(), indent=2)
+            (self.dir / "versions.json").write_text(text + "\n")
         # The run as it is now: a resume may have changed the number of updates or the logger.
         self.config = {**OmegaConf.to_container(cfg, resolve=True), "resume": None}
         (self.dir / "config.yaml").write_text(OmegaConf.to_yaml(self.config))
-        self.parts, self.counters, self.facts = parts, counters, facts or {}
-        self.script = script
         self._saved: int | None = None  # frames at the latest checkpoint of this sitting
-        self.logger = RunLogger(self.dir, self.config, counters.updates if resumed else None)
-        self.bar = ProgressBar(cfg.optim.total_updates, counters.updates)
+        updates = self.counters.updates
+        self.logger = RunLogger(self.dir, self.config, updates if resumed else None)
+        self.bar = ProgressBar(cfg.optim.total_updates, updates)
         self._signal = StopSignal()
-        self._lap = (time.perf_counter(), counters.updates, counters.frames)
+        self._lap = (time.perf_counter(), updates, self.counters.frames)
         self.bar.write(f"run directory: {self.dir}")
-        if counters.frames < (warmup := cfg.collector.init_random_frames):
+        if self.counters.frames < (warmup := cfg.collector.init_random_frames):
             self.bar.write(f"the first {warmup} frames are random actions, without updates")
 
     def __enter__(self) -> Run:
@@ -121,10 +147,11 @@ class Run:
     def __exit__(self, *exc_info: object) -> None:
         """Closes the log."""
         self._signal.__exit__(*exc_info)
-        self.bar.close()
-        self.logger.close()
-        self._lock.release()
-        Path(self._lock.lock_file).unlink(missing_ok=True)
+        try:
+            self.bar.close()
+            self.logger.close()
+        finally:
+            self._lock.release()
 
     @property
     def stopping(self) -> bool:
