@@ -55,6 +55,14 @@ class Curve:
 
     runs: list[Run]
 
+    def __post_init__(self) -> None:
+        seeds = [run.config["seed"] for run in self.runs]
+        if len(set(seeds)) < len(seeds):
+            dirs = ", ".join(str(run.dir) for run in self.runs)
+            raise SystemExit(
+                f"error: {dirs} have equal settings and seeds {seeds}. Name each once."
+            )
+
     @property
     def label(self) -> str:
         config, seeds = self.runs[0].config, [run.config["seed"] for run in self.runs]
@@ -80,11 +88,18 @@ def make_curves(run_dirs: Sequence[Path]) -> list[Curve]:
     return [Curve(list(group)) for _, group in groupby(runs, key=lambda run: run.settings)]
 
 
-def draw(axes: Axes, curve: Curve) -> None:
+def labels(curves: Sequence[Curve]) -> list[str]:
+    """What the curves are called; with a directory's name where that alone tells two apart."""
+    plain = [curve.label for curve in curves]
+    names = [curve.runs[0].dir.name for curve in curves]
+    return [f"{x} ({n})" if plain.count(x) > 1 else x for x, n in zip(plain, names, strict=True)]
+
+
+def draw(axes: Axes, curve: Curve, label: str) -> None:
     """Adds a curve to a figure."""
     updates = curve.shared()
     values = [mean(curve.at(u)) for u in updates]
-    (line,) = axes.plot(updates, values, marker="o", markersize=3, label=curve.label)
+    (line,) = axes.plot(updates, values, marker="o", markersize=3, label=label)
     if len(curve.runs) > 1:
         for run in curve.runs:
             thin = {"color": line.get_color(), "alpha": 0.4, "linewidth": 1}
@@ -95,15 +110,16 @@ def draw(axes: Axes, curve: Curve) -> None:
     axes.fill_between(updates, low, high, alpha=0.15, color=line.get_color(), linewidth=0)
 
 
-def frames_per_update(curves: Sequence[Curve]) -> str:
-    """How many environment frames an update is, as text."""
+def unit(curves: Sequence[Curve]) -> str:
+    """What the horizontal axis counts: updates, and how many frames one is."""
     rates = sorted({1 / curve.runs[0].config["optim"]["utd_ratio"] for curve in curves})
-    return " or ".join(f"{rate:g}" for rate in rates)
+    frames = "env frame" if rates == [1] else "env frames"
+    return f"updates ({' or '.join(f'{rate:g}' for rate in rates)} {frames} each)"
 
 
 def table(curves: Sequence[Curve]) -> str:
     """The means over seeds at each evaluation, with the seeds' own in brackets, in Markdown."""
-    lines = ["| " + " | ".join(["updates", *(curve.label for curve in curves)]) + " |"]
+    lines = ["| " + " | ".join(["updates", *labels(curves)]) + " |"]
     lines.append("|" + "--:|" * (len(curves) + 1))
     for updates in sorted({u for curve in curves for u in curve.shared()}):
         cells = [f"{updates:,.0f}"]
@@ -126,14 +142,13 @@ def main() -> None:
     curves = make_curves(arguments.run_dirs)
     figure = Figure(figsize=(6.4, 4), layout="constrained")
     axes = figure.subplots()
-    for curve in curves:
-        draw(axes, curve)
+    for curve, label in zip(curves, labels(curves), strict=True):
+        draw(axes, curve, label)
     for text in arguments.line:
         name, value = text.split("=")
         axes.axhline(float(value), color="0.4", linestyle="--", linewidth=1, label=name)
-    unit = f"updates ({frames_per_update(curves)} env frames each)"
     title = ", ".join(sorted({curve.runs[0].config["env"]["name"] for curve in curves}))
-    axes.set(title=title, xlabel=unit, ylabel="evaluation return")
+    axes.set(title=title, xlabel=unit(curves), ylabel="evaluation return")
     axes.grid(alpha=0.3)
     axes.legend(frameon=False)
     figure.savefig(arguments.output, dpi=150)
