@@ -91,6 +91,7 @@ def test_run_directory(unbroken):
     names = {path.name for path in unbroken.iterdir()}
     assert re.fullmatch(r"Hopper-v4-sac-s0-\d{8}-\d{6}", unbroken.name)
     assert names == {
+        ".lock",
         "config.yaml",
         "versions.json",
         "metrics.csv",
