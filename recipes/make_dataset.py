@@ -66,10 +66,8 @@ def make_dataset(cfg: DictConfig) -> OfflineDataset:
     ) as writer:
         for episode in episodes_of(cfg, env, source):
             writer.add_episode(**episode)
-        name, returns = (
-            f"{task} {cfg.tier} (D4RL-style, locally generated)",
-            writer.complete(writer.returns),
-        )
+        name = f"{task} {cfg.tier} (D4RL-style, locally generated)"
+        returns = writer.complete(writer.returns)
         if cfg.check:
             check_returns(cfg, returns)
         plot_returns(writer.staging / "returns.png", returns, name)
