@@ -301,10 +301,7 @@ class ACALoss(TDLoss):
             params=self.target_qvalue_network_params,
         )
         next_value = next_values.amin(-1, keepdim=True)
-        data = tensordict.clone(recurse=False)
-        reward = next_key(keys.reward)
-        data.set(reward, self.reward_scale * data[reward])
-        return self._td_target(data, next_value)
+        return self._td_target(tensordict, next_value, self.reward_scale)
 
     def _state_and_action(self, tensordict: TensorDictBase) -> tuple[list[Tensor], Tensor]:
         """Observations as they are, and the action in critic units."""

@@ -41,20 +41,25 @@ class TDLoss(LossModule):
     def _state_keys(self) -> list[NestedKey]:
         """Keys of what the networks see of a state."""
 
-    def _td_target(self, data: TensorDictBase, next_value: Tensor) -> Tensor:
+    def _td_target(
+        self, tensordict: TensorDictBase, next_value: Tensor, reward_scale: float = 1.0
+    ) -> Tensor:
         """The target ``y`` of shape ``(*batch, 1)``, made by the value estimator.
 
         Args:
-            data: rewards and flags below ``"next"``; the next value is written to it.
+            tensordict: rewards and flags below ``"next"``, and the steps of n-step returns, if any.
             next_value: ``V(s')``, shape ``(*batch, 1)``.
+            reward_scale: factor of the rewards.
         """
-        keys = self.tensor_keys
-        # The estimator would go on without one of these: a KeyError names it.
-        data.select(*map(next_key, (keys.reward, keys.done, keys.terminated)))
+        keys, read = self.tensor_keys, self.value_estimator.tensor_keys
+        reward, done, terminated = map(next_key, (keys.reward, keys.done, keys.terminated))
+        data = tensordict.select(reward, done, terminated)
+        if (steps := tensordict.get(read.steps_to_next_obs, None)) is not None:
+            data.set(read.steps_to_next_obs, steps)
+        data.set(reward, reward_scale * data[reward])
         # A terminal state may hold anything, NaN included: its value is zero, not zero times that.
-        terminated = data[next_key(keys.terminated)]
-        next_value = next_value.masked_fill(terminated.reshape(next_value.shape), 0.0)
-        data.set(next_key(self.value_estimator.tensor_keys.value), next_value)
+        next_value = next_value.masked_fill(data[terminated].reshape(next_value.shape), 0.0)
+        data.set(next_key(read.value), next_value)
         return self.value_estimator.value_estimate(data).reshape(next_value.shape)
 
     def _output(

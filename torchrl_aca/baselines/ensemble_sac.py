@@ -287,7 +287,7 @@ class EnsembleSACLoss(TDLoss):
         next_value = next_values.amin(-1, keepdim=True)
         if self.entropy_backup:
             next_value = next_value - self.alpha * log_prob.unsqueeze(-1)
-        return self._td_target(tensordict.clone(recurse=False), next_value)
+        return self._td_target(tensordict, next_value)
 
     def _state_keys(self) -> list[NestedKey]:
         networks = [*self.actor_network.in_keys, *self.qvalue_network.in_keys]
