@@ -18,7 +18,12 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
-from torchrl_aca.training.checkpoint import list_checkpoints, read_checkpoint, restore
+from torchrl_aca.training.checkpoint import (
+    list_checkpoints,
+    read_checkpoint,
+    restore,
+    updates_of,
+)
 from torchrl_aca.training.config import apply_overrides, require_equal, resumed_config
 from torchrl_aca.training.envs import make_vector_env
 from torchrl_aca.training.errors import RunError
@@ -151,7 +156,7 @@ def is_finished(run_dir: Path, cfg: DictConfig) -> bool:
     history = evaluations(run_dir)
     updates = history[-1]["updates"]
     # A run that was killed between its last evaluation and its last checkpoint still has to go on.
-    saved = list_checkpoints(run_dir / "checkpoints")[-1].stem.endswith(f"_{int(updates):010d}")
+    saved = updates_of(list_checkpoints(run_dir / "checkpoints")[-1]) == updates
     enough = updates >= cfg.optim.total_updates or has_reached(history, cfg.eval.stop_return)
     return saved and enough
 

@@ -96,7 +96,4 @@ def test_tables_in_the_readme_are_what_the_command_prints(plot, command):
     _, _, *arguments = shlex.split(command)
     named = [a for a in arguments if a.startswith("results/")]
     run_dirs = [path for name in named for path in sorted(RESULTS.parent.glob(name))]
-    rows = plot.table(plot.make_curves(run_dirs)).splitlines()[2:]
-    assert rows
-    text = (RESULTS / "README.md").read_text()
-    assert [row for row in rows if row not in text] == []
+    assert plot.table(plot.make_curves(run_dirs)) in (RESULTS / "README.md").read_text()

@@ -14,7 +14,7 @@ from torchrl_aca.offline.errors import DatasetError
 Bounds = tuple[float | Sequence[float], float | Sequence[float]]
 
 
-def size(name: str, given: Any) -> int:
+def as_size(name: str, given: Any) -> int:
     """A number of columns, as a Python integer: JSON does not know NumPy's."""
     try:
         number = operator.index(given)
@@ -25,7 +25,7 @@ def size(name: str, given: Any) -> int:
     return number
 
 
-def bounds(given: Bounds, action_dim: int) -> tuple[torch.Tensor, torch.Tensor]:
+def as_bounds(given: Bounds, action_dim: int) -> tuple[torch.Tensor, torch.Tensor]:
     """The smallest and the largest action, shape (A,) each."""
     try:
         low, high = (torch.as_tensor(bound, dtype=torch.float32) for bound in given)
@@ -42,7 +42,7 @@ def bounds(given: Bounds, action_dim: int) -> tuple[torch.Tensor, torch.Tensor]:
     return low.expand(action_dim).clone(), high.expand(action_dim).clone()
 
 
-def score_range(scores: tuple[float, float] | None) -> dict[str, float] | None:
+def as_scores(scores: tuple[float, float] | None) -> dict[str, float] | None:
     """Reference scores as the metadata hold them."""
     if scores is None:
         return None

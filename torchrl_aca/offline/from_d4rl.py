@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from torchrl_aca.offline.arguments import score_range
+from torchrl_aca.offline.arguments import as_scores
 from torchrl_aca.offline.dataset import OfflineDataset
 from torchrl_aca.offline.errors import DatasetError
 from torchrl_aca.offline.importing import provenance_of, reading, write_episodes
@@ -63,7 +63,7 @@ def import_d4rl(
     import h5py
 
     scores = known_scores(env_id) if reference_scores is None else reference_scores
-    score_range(scores)  # before the work
+    as_scores(scores)  # before the work
     source = Path(source)
     if not source.is_file() or not h5py.is_hdf5(source):
         state = "is no HDF5 file" if source.is_file() else "does not exist"

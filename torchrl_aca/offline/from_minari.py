@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from torchrl_aca.offline.arguments import score_range
+from torchrl_aca.offline.arguments import as_scores
 from torchrl_aca.offline.dataset import OfflineDataset
 from torchrl_aca.offline.errors import DatasetError
 from torchrl_aca.offline.importing import provenance_of, reading, write_episodes
@@ -57,7 +57,7 @@ def import_minari(
     )
     options.setdefault("action_bounds", (dataset.action_space.low, dataset.action_space.high))
     scores = _scores(dataset) if reference_scores is None else reference_scores
-    score_range(scores)  # before the work
+    as_scores(scores)  # before the work
     file = Path(dataset.storage.data_path) / "main_data.hdf5"
     with DatasetWriter(path, observation_dim, action_dim, **options) as writer:
         write_episodes(writer, _episodes(dataset, source), dataset.total_steps, progress)

@@ -103,7 +103,7 @@ def _describe(dtype: torch.dtype, shape: tuple[int, ...], device: torch.device) 
 
 
 def fingerprint(rows: TensorDictBase, keys: Sequence[NestedKey]) -> str:
-    """SHA-256 of all rows, read a block at a time: about a second for a million transitions."""
+    """SHA-256 of all rows, which are read once, a block at a time."""
     digest = hashlib.sha256()
     for key in keys if len(rows) else ():
         column = rows.get(key)

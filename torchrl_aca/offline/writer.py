@@ -16,7 +16,7 @@ import torch
 from tensordict import MemoryMappedTensor, TensorDict
 from tensordict.utils import NestedKey
 
-from torchrl_aca.offline.arguments import Bounds, bounds, score_range, size
+from torchrl_aca.offline.arguments import Bounds, as_bounds, as_scores, as_size
 from torchrl_aca.offline.check import DatasetChecks
 from torchrl_aca.offline.dataset import OfflineDataset, check_file
 from torchrl_aca.offline.errors import DatasetError
@@ -75,10 +75,10 @@ class DatasetWriter:
                 f"{self.path} exists already; expected a new directory. Choose another path, or "
                 "delete it first."
             )
-        self.observation_dim = size("observation_dim", observation_dim)
-        self.action_dim = size("action_dim", action_dim)
+        self.observation_dim = as_size("observation_dim", observation_dim)
+        self.action_dim = as_size("action_dim", action_dim)
         self.layout = row_layout(self.observation_dim, self.action_dim)
-        self.bounds = bounds(action_bounds, self.action_dim)
+        self.bounds = as_bounds(action_bounds, self.action_dim)
         self.checks = DatasetChecks(*self.bounds, allow_constant, check_continuity)
         self.staging = self.path.with_name(self.path.name + ".partial")
         self.returns: list[float] = []
@@ -193,7 +193,7 @@ class DatasetWriter:
                 nothing is at the path then.
         """
         self._require_staging()
-        scores, checked = score_range(reference_scores), self.checks.finish()
+        scores, checked = as_scores(reference_scores), self.checks.finish()
         self._sync()
         low, high = (bound.tolist() for bound in self.bounds)
         metadata = {

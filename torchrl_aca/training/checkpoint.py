@@ -71,6 +71,11 @@ def save_checkpoint(
     return path
 
 
+def updates_of(path: Path) -> int:
+    """Returns after how many updates a checkpoint was written; its name tells."""
+    return int(path.stem.rpartition("_")[2])
+
+
 def list_checkpoints(directory: Path) -> list[Path]:
     """Returns the checkpoints in a directory, oldest first."""
     return sorted(directory.glob("checkpoint_*.pt"))

@@ -15,7 +15,12 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 
 from torchrl_aca.training.agent import Stateful
-from torchrl_aca.training.checkpoint import Counters, list_checkpoints, save_checkpoint
+from torchrl_aca.training.checkpoint import (
+    Counters,
+    list_checkpoints,
+    save_checkpoint,
+    updates_of,
+)
 from torchrl_aca.training.data import check_finite
 from torchrl_aca.training.errors import RunError
 from torchrl_aca.training.logging import ProgressBar, RunLogger
@@ -64,7 +69,7 @@ def lock(run_dir: Path) -> FileLock:
 def require_newest(run_dir: Path, updates: int) -> None:
     """Raises `RunError` if a checkpoint newer than the one just read has come meanwhile."""
     newest = list_checkpoints(run_dir / "checkpoints")[-1]
-    if not newest.stem.endswith(f"_{updates:010d}"):
+    if updates_of(newest) != updates:
         raise RunError(
             f"{run_dir} went on to {newest.name} while its checkpoint of {updates} updates was "
             "read. Resume it again."
