@@ -33,12 +33,12 @@ from omegaconf import DictConfig, OmegaConf
 from torchrl import logger as torchrl_logger
 from torchrl.collectors import Collector
 from torchrl.modules import MLP, ValueOperator
+from torchrl_aca.training.data import make_replay_buffer, transitions
 from tqdm import tqdm
 from two_d_bandit import TwoDBandit, mode_shares, reward
 
 from torchrl_aca import ACALoss, CriticGuidedDenoisingActor, NoiseLevelCritic, NoiseSchedule
-from torchrl_aca.training.data import make_replay_buffer, transitions
-from torchrl_aca.training.errors import RunError
+from torchrl_aca.errors import RunError
 from torchrl_aca.training.randomness import seed_everything
 from torchrl_aca.training.report import versions
 

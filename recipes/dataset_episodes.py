@@ -18,6 +18,7 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
+from torchrl_aca.errors import RunError
 from torchrl_aca.training.checkpoint import (
     list_checkpoints,
     read_checkpoint,
@@ -26,7 +27,6 @@ from torchrl_aca.training.checkpoint import (
 )
 from torchrl_aca.training.config import apply_overrides, require_equal, resumed_config
 from torchrl_aca.training.envs import make_vector_env
-from torchrl_aca.training.errors import RunError
 from torchrl_aca.training.run import has_reached
 
 Episode = dict[str, Any]  # keywords of `DatasetWriter.add_episode`

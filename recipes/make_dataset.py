@@ -31,11 +31,11 @@ from dataset_episodes import (
 from import_dataset import summary
 from omegaconf import DictConfig, OmegaConf
 
+from torchrl_aca.errors import RunError
 from torchrl_aca.offline import DatasetError, DatasetWriter, OfflineDataset, reference_scores
 from torchrl_aca.offline.registry import ROOT
 from torchrl_aca.training.config import is_count, require
 from torchrl_aca.training.envs import make_env
-from torchrl_aca.training.errors import RunError
 from torchrl_aca.training.report import plot_returns, versions
 
 TIERS = ("random", "medium", "medium_replay")

@@ -12,14 +12,14 @@ from make_dataset import make_dataset, task_name
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 from torchrl.envs import EnvBase
+from torchrl_aca.training.data import TRANSITION_KEYS, make_replay_buffer
 
+from torchrl_aca.errors import RunError
 from torchrl_aca.offline import MixedReplayBuffer, OfflineDataset, reference_scores
 from torchrl_aca.offline.layout import METADATA_FILE, sha256
 from torchrl_aca.offline.registry import ROOT
 from torchrl_aca.offline.scores import Scores
 from torchrl_aca.training.config import require
-from torchrl_aca.training.data import TRANSITION_KEYS, make_replay_buffer
-from torchrl_aca.training.errors import RunError
 
 
 def dataset_path(cfg: DictConfig) -> Path:

@@ -20,7 +20,7 @@ from recipe_cases import CONFIGS, RECIPES, composed, rows_of, run
 from torchrl_aca.offline import DatasetError, OfflineDataset
 from torchrl_aca.training.checkpoint import read_checkpoint
 from torchrl_aca.training.envs import make_env, make_vector_env
-from torchrl_aca.training.errors import RunError
+from torchrl_aca.errors import RunError
 
 SAC = [
     "sac.num_cells=[16,16]",

@@ -19,10 +19,10 @@ from torchrl.data import (
 )
 from torchrl.envs import RewardScaling
 
-from torchrl_aca.offline import MixedReplayBuffer
+from torchrl_aca.replay import MixedReplayBuffer
 from torchrl_aca.training.checkpoint import read_checkpoint, restore, save_checkpoint
 from torchrl_aca.training.data import transitions
-from torchrl_aca.training.errors import RunError
+from torchrl_aca.errors import RunError
 
 FLOAT64 = torch.float64
 

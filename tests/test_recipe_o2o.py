@@ -25,7 +25,7 @@ from recipe_cases import (
 from torchrl_aca.offline import DatasetError, DatasetWriter
 from torchrl_aca.offline.layout import sha256
 from torchrl_aca.training.config import resumed_config
-from torchrl_aca.training.errors import RunError
+from torchrl_aca.errors import RunError
 
 SIZES = {"observation_dim": 11, "action_dim": 3}  # Hopper's
 MARK = 1000.0  # below every offline reward, above every online one

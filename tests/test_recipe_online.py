@@ -30,7 +30,7 @@ from recipe_cases import (
 from torchrl_aca.training.checkpoint import list_checkpoints
 from torchrl_aca.training.config import resumed_config
 from torchrl_aca.training.envs import make_env
-from torchrl_aca.training.errors import RunError
+from torchrl_aca.errors import RunError
 
 SCRIPT = RECIPES / "online_mujoco.py"
 TINY_RUN = [

@@ -13,7 +13,7 @@ from tensordict import TensorDict
 
 from torchrl_aca.training.acceleration import capture, compiled, make_adam
 from torchrl_aca.training.envs import make_vector_env
-from torchrl_aca.training.errors import RunError
+from torchrl_aca.errors import RunError
 
 TINY = [
     "env=inverted_pendulum",

@@ -13,7 +13,7 @@ from torchrl_aca.training.data import (
     make_replay_buffer,
     transitions,
 )
-from torchrl_aca.training.errors import RunError
+from torchrl_aca.errors import RunError
 
 
 def collected(num_envs: int = 5, steps: int = 1, observation_dim: int = 17, action_dim: int = 6):

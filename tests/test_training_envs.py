@@ -15,7 +15,7 @@ from torchrl_aca.training.envs import (
     make_env,
     make_vector_env,
 )
-from torchrl_aca.training.errors import RunError
+from torchrl_aca.errors import RunError
 
 
 def bare_env(name: str, seed: int) -> gym.Env:

@@ -20,7 +20,7 @@ from torchrl_aca.training.checkpoint import (
     save_checkpoint,
 )
 from torchrl_aca.training.config import validate
-from torchrl_aca.training.errors import RunError
+from torchrl_aca.errors import RunError
 from torchrl_aca.training.logging import CsvTable, MetricMeans, ProgressBar
 from torchrl_aca.training.randomness import RandomState, seed_everything
 from torchrl_aca.training.run import Run, StopSignal, has_reached

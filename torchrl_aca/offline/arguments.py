@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from torchrl_aca.offline.errors import DatasetError
+from torchrl_aca.errors import DatasetError
 
 Bounds = tuple[float | Sequence[float], float | Sequence[float]]
 

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from tensordict.utils import NestedKey
 
-from torchrl_aca.offline.errors import DatasetError
+from torchrl_aca.errors import DatasetError
 from torchrl_aca.offline.layout import dotted
 
 NUMBERS: tuple[NestedKey, ...] = (

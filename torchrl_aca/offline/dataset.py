@@ -12,7 +12,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import ImmutableDatasetWriter, ReplayBuffer, TensorStorage
 
-from torchrl_aca.offline.errors import DatasetError
+from torchrl_aca.errors import DatasetError
 from torchrl_aca.offline.layout import (
     FORMAT,
     METADATA_FILE,

@@ -8,9 +8,9 @@ from typing import Any
 
 import torch
 
+from torchrl_aca.errors import DatasetError
 from torchrl_aca.offline.arguments import as_scores
 from torchrl_aca.offline.dataset import OfflineDataset
-from torchrl_aca.offline.errors import DatasetError
 from torchrl_aca.offline.importing import provenance_of, reading, write_episodes
 from torchrl_aca.offline.scores import reference_scores as known_scores
 from torchrl_aca.offline.writer import DatasetWriter

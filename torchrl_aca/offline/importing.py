@@ -8,7 +8,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from torchrl_aca.offline.errors import DatasetError
+from torchrl_aca.errors import DatasetError
 from torchrl_aca.offline.layout import sha256
 from torchrl_aca.offline.writer import DatasetWriter
 

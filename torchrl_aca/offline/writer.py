@@ -16,10 +16,10 @@ import torch
 from tensordict import MemoryMappedTensor, TensorDict
 from tensordict.utils import NestedKey
 
+from torchrl_aca.errors import DatasetError
 from torchrl_aca.offline.arguments import Bounds, as_bounds, as_scores, as_size
 from torchrl_aca.offline.check import DatasetChecks
 from torchrl_aca.offline.dataset import OfflineDataset, check_file
-from torchrl_aca.offline.errors import DatasetError
 from torchrl_aca.offline.layout import (
     FORMAT,
     METADATA_FILE,

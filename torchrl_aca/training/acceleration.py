@@ -1,4 +1,4 @@
-"""What `compile` and `cudagraphs` of a configuration do to the parts of an update."""
+"""What compiling and CUDA graphs do to the parts of an update."""
 
 from __future__ import annotations
 
@@ -6,20 +6,19 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
-from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from tensordict.nn import CudaGraphModule
 
 Step = Callable[[TensorDictBase], TensorDictBase | None]
 
 
-def compiled(function: Callable[..., Any], cfg: DictConfig) -> Callable[..., Any]:
-    """Returns `function`, compiled at its first call where `cfg.compile` asks for it."""
-    return torch.compile(function) if cfg.compile else function
+def compiled(function: Callable[..., Any], enabled: bool) -> Callable[..., Any]:
+    """Returns `function`, compiled at its first call where that is enabled."""
+    return torch.compile(function) if enabled else function
 
 
-def capture(step: Step, cfg: DictConfig) -> Step:
-    """Returns `step`, captured as a CUDA graph where `cfg.cudagraphs` asks for it.
+def capture(step: Step, enabled: bool) -> Step:
+    """Returns `step`, captured as a CUDA graph where that is enabled.
 
     The first calls run as they are; from then on a call copies the batch to where the graph reads
     it and replays the recorded kernels. On a machine without CUDA calls pass through.
@@ -27,17 +26,17 @@ def capture(step: Step, cfg: DictConfig) -> Step:
     Args:
         step: A function of a batch of fixed shape, without decisions that depend on values, whose
             result is detached.
-        cfg: A recipe's configuration.
+        enabled: Whether to capture.
     """
-    return CudaGraphModule(step, in_keys=[], out_keys=[], warmup=5) if cfg.cudagraphs else step
+    return CudaGraphModule(step, in_keys=[], out_keys=[], warmup=5) if enabled else step
 
 
 def make_adam(
-    parameters: Iterable[torch.nn.Parameter], lr: float, cfg: DictConfig
+    parameters: Iterable[torch.nn.Parameter], lr: float, cudagraphs: bool
 ) -> torch.optim.Adam:
     """Builds Adam in its fused form; for a CUDA graph, with a learning rate that can change."""
     parameters = list(parameters)
-    if cfg.cudagraphs and parameters[0].is_cuda:
+    if cudagraphs and parameters[0].is_cuda:
         rate = torch.tensor(lr, device=parameters[0].device)
         adam = torch.optim.Adam(parameters, lr=rate, fused=True, capturable=True)
         adam.register_load_state_dict_post_hook(_rates_to_device)

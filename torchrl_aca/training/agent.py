@@ -8,6 +8,9 @@ from typing import Any, Protocol
 
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+
+Update = Callable[[TensorDictBase], TensorDictBase]
 
 
 class Stateful(Protocol):
@@ -32,8 +35,13 @@ class Agent:
             updates that report it.
         state: Everything that the next update depends on, by name: the loss with its targets,
             optimisers, schedulers, counters. It is what a checkpoint saves and restores.
+        offline_update: As `update`, for the phase on the data set alone; None for a method that
+            has no such phase.
+        extra_keys: What a row of the replay buffer holds besides the transition.
     """
 
     policy: TensorDictModuleBase
-    update: Callable[[TensorDictBase], TensorDictBase]
+    update: Update
     state: dict[str, Stateful]
+    offline_update: Update | None = None
+    extra_keys: tuple[NestedKey, ...] = ()

@@ -1,19 +1,20 @@
-"""Checkpoints of a whole run: written atomically, rotated, restored bit for bit."""
+"""Checkpoints of a whole run: written atomically, rotated, checked, restored bit for bit."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Collection, Mapping
+import zipfile
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from torchrl_aca.errors import RunError
 from torchrl_aca.training.agent import Stateful
-from torchrl_aca.training.errors import RunError
+from torchrl_aca.training.files import replace_file
 
-FORMAT = "torchrl-aca run 1"
+FORMAT = "torchrl-aca run 2"
 
 
 @dataclass
@@ -21,27 +22,28 @@ class Counters:
     """How far a run is.
 
     Attributes:
-        updates: Gradient updates made.
-        frames: Environment steps made, over all copies, warm-up included.
-        seconds: Wall-clock time spent, over all sittings.
+        updates: Gradient updates made in the online phase.
+        offline_updates: Those made in the offline phase, on the data set alone.
+        seconds: Wall-clock time spent, over all sessions.
     """
 
     updates: int = 0
-    frames: int = 0
+    offline_updates: int = 0
     seconds: float = 0.0
 
-    def passed(self, interval: int, since: int) -> bool:
-        """Tells whether a multiple of `interval` lies in the updates after `since`."""
-        return since // interval < self.updates // interval
+    @property
+    def total(self) -> int:
+        """The updates of both phases."""
+        return self.offline_updates + self.updates
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns the three numbers."""
+        """Returns the numbers."""
         return asdict(self)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restores what `state_dict` returned."""
         self.updates = state_dict["updates"]
-        self.frames = state_dict["frames"]
+        self.offline_updates = state_dict["offline_updates"]
         self.seconds = state_dict["seconds"]
 
 
@@ -54,18 +56,13 @@ def save_checkpoint(
 ) -> Path:
     """Writes `checkpoint_<updates>.pt` and removes all but the newest `keep_last` ones.
 
-    The file is written under a temporary name and renamed when it is complete: a crash in between
-    leaves the earlier checkpoints as they are.
+    A crash while it is written leaves the earlier checkpoints as they are.
     """
     directory.mkdir(parents=True, exist_ok=True)
     path = directory / f"checkpoint_{updates:010d}.pt"
-    temporary = path.with_suffix(".tmp")
     states = {name: part.state_dict() for name, part in parts.items()}
-    with open(temporary, "wb") as file:
-        torch.save({"format": FORMAT, "config": config, "parts": states}, file)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
+    content = {"format": FORMAT, "config": config, "parts": states}
+    replace_file(path, lambda file: torch.save(content, file))
     for old in list_checkpoints(directory)[:-keep_last]:
         old.unlink()
     return path
@@ -88,53 +85,73 @@ def read_checkpoint(run_dir: Path) -> dict[str, Any]:
         A dict with "config" and "parts".
 
     Raises:
-        RunError: If there is none, or it is no checkpoint of a recipe.
+        RunError: If there is none, or it is damaged or no checkpoint of a recipe. If the one before
+            it is intact, the message says how to go on from that.
     """
     checkpoints = list_checkpoints(run_dir / "checkpoints")
     if not checkpoints:
         raise RunError(
             f"resume={run_dir}: expected a run directory with checkpoints/checkpoint_*.pt, found "
-            "none. Give the directory that the run printed when it started."
+            "none. Give the directory that the run printed when it started; a run that was killed "
+            "before its first checkpoint is started again by its own command."
         )
-    try:
-        content = torch.load(checkpoints[-1], map_location="cpu", weights_only=True)
-    except Exception as error:  # what unpickling raises depends on the foreign bytes
-        raise RunError(
-            f"{checkpoints[-1]} cannot be read as a checkpoint ({type(error).__name__}); expected "
-            "a file that this recipe wrote. Delete it to go on from the one before."
-        ) from error
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise RunError(
-            f"{checkpoints[-1]} is no checkpoint of this recipe: expected format {FORMAT!r}, got "
-            f"{content.get('format') if isinstance(content, dict) else type(content).__name__!r}."
-        )
+    content, fault = _read(checkpoints[-1])
+    if fault:
+        raise RunError(f"{checkpoints[-1]} {fault}. {_way_out(checkpoints)}")
     return content
 
 
-def restore(
-    parts: Mapping[str, Stateful], states: Mapping[str, Any], optional: Collection[str] = ()
-) -> None:
-    """Loads saved states into the parts of a run.
+def _way_out(checkpoints: list[Path]) -> str:
+    """What to do about a newest checkpoint that cannot be used."""
+    for before in reversed(checkpoints[:-1]):
+        if not _read(before)[1]:
+            return f"{before.name} is intact: delete the newer ones to go on from it."
+    return "There is no intact one before it: start a new run."
 
-    Args:
-        parts: What to restore, by name.
-        states: The "parts" of a checkpoint.
-        optional: Parts that stay as they are if the checkpoint leaves them out.
+
+def _read(path: Path) -> tuple[dict[str, Any], str]:
+    """The content of a checkpoint, and what is wrong with it: nothing where it can be used."""
+    try:
+        with zipfile.ZipFile(path) as file:  # torch.save writes a checksum of every record
+            if (record := file.testzip()) is not None:
+                return {}, f"is damaged: the checksum of its {record!r} does not fit"
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # what unpickling raises depends on the foreign bytes
+        return {}, f"cannot be read as a checkpoint ({type(error).__name__}): damaged or foreign"
+    found = content.get("format") if isinstance(content, dict) else type(content).__name__
+    if found != FORMAT:
+        return {}, f"is no checkpoint of this version: expected {FORMAT!r}, got {found!r}"
+    for name, path_to in (
+        ("config", ("config",)),
+        ("parts", ("parts",)),
+        ("counters", ("parts", "counters")),
+    ):
+        value: Any = content
+        for key in path_to:
+            value = value.get(key)
+        if not isinstance(value, dict):
+            return {}, f"has no {name}: expected a dict, got {type(value).__name__}"
+    return content, ""
+
+
+def restore(parts: Mapping[str, Stateful], states: Mapping[str, Any]) -> None:
+    """Loads saved states into the parts of a run, in the order of `parts`.
 
     Raises:
         RunError: If names or shapes differ, which means that the code or the configuration is
             another one than the checkpoint's.
     """
-    if missing := parts.keys() - states.keys() - set(optional):
+    if missing := parts.keys() - states.keys():
         raise RunError(
             f"the checkpoint has no {sorted(missing)}; it holds {sorted(states)}. It was written "
             "by another algorithm or version: resume with the code that wrote it."
         )
-    for name in parts.keys() & states.keys():
+    for name, part in parts.items():
         try:
-            parts[name].load_state_dict(states[name])
-        except (RuntimeError, ValueError, KeyError) as error:
+            part.load_state_dict(states[name])
+        except Exception as error:  # every part has exceptions of its own for foreign values
             raise RunError(
-                f"the checkpoint's {name!r} does not fit what the configuration builds: {error}. "
-                "Resume with the unchanged config.yaml of the run."
+                f"the checkpoint's {name!r} does not fit what the configuration builds: "
+                f"{type(error).__name__}: {error}. Resume with the unchanged config.yaml of the "
+                "run and the code that wrote it."
             ) from error

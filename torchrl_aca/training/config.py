@@ -10,13 +10,13 @@ from omegaconf.errors import OmegaConfBaseException
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import ErrorDetails, PydanticCustomError
 
-from torchrl_aca.training.errors import RunError
+from torchrl_aca.errors import RunError
 
 Count = Annotated[int, Field(ge=1, le=10**12)]
 Seed = Annotated[int, Field(ge=0, lt=2**32 - 10**6)]  # of NumPy's range, with room for the copies
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
-Fraction = Annotated[float, Field(ge=0, le=1)]
+Share = Annotated[float, Field(ge=0, le=1)]
 Widths = Annotated[list[Annotated[int, Field(ge=1, le=10**5)]], Field(min_length=1)]
 
 
@@ -30,8 +30,8 @@ class Section(BaseModel):
         value: Any = self
         for name in key.split("."):
             value = getattr(value, name)
-        details = {"key": key, "value": value}
-        raise PydanticCustomError("misfit", "Input should be {expected}", {**details, "expected": expected})
+        details = {"key": key, "value": value, "expected": expected}
+        raise PydanticCustomError("misfit", "Input should be {expected}", details)
 
 
 class Env(Section):

@@ -2,22 +2,37 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import gymnasium as gym
-import mujoco
 import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import DtypeObservation, TimeLimit
 from torchrl.envs import GymWrapper
 
-from torchrl_aca.training.errors import RunError
+from torchrl_aca.errors import RunError
 
-_INTEGRATION_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+
+def import_mujoco() -> Any:
+    """Imports MuJoCo, which loads the renderer that `MUJOCO_GL` names at once.
+
+    Raises:
+        RunError: If that fails.
+    """
+    try:
+        import mujoco
+    except Exception as error:  # each renderer has exceptions of its own
+        raise RunError(
+            f"MuJoCo cannot be loaded with MUJOCO_GL={os.environ.get('MUJOCO_GL')!r}: {error}. "
+            "Unset MUJOCO_GL, or install the library of that renderer (libOSMesa for osmesa, "
+            "libEGL for egl)."
+        ) from error
+    return mujoco
 
 
 class ResumableEnv(gym.Wrapper):
@@ -53,8 +68,8 @@ class ResumableEnv(gym.Wrapper):
     def state_dict(self) -> dict[str, Any]:
         """Returns random stream, elapsed steps, last observation and the simulator's arrays."""
         state: dict[str, Any] = {"random": self.unwrapped.np_random.bit_generator.state}
-        if isinstance(getattr(self.unwrapped, "data", None), mujoco.MjData):
-            state["elapsed_steps"] = self._time_limit._elapsed_steps if self._time_limit else None
+        if isinstance(getattr(self.unwrapped, "data", None), import_mujoco().MjData):
+            state["elapsed_steps"] = self.time_limit._elapsed_steps if self.time_limit else None
             state["observation"] = torch.from_numpy(np.array(self._observation))
             state["simulation"] = _simulation_state(self.unwrapped.model, self.unwrapped.data)
         return state
@@ -67,14 +82,15 @@ class ResumableEnv(gym.Wrapper):
         if "simulation" not in state_dict:
             self.reset()
             return
-        if self._time_limit:
-            self._time_limit._elapsed_steps = state_dict["elapsed_steps"]
+        if self.time_limit:
+            self.time_limit._elapsed_steps = state_dict["elapsed_steps"]
         self._observation = state_dict["observation"].numpy()
         _load_simulation_state(self.unwrapped.model, self.unwrapped.data, state_dict["simulation"])
         self._resumed = True
 
     @property
-    def _time_limit(self) -> TimeLimit | None:
+    def time_limit(self) -> TimeLimit | None:
+        """The wrapper that ends episodes, if there is one."""
         env = self.env
         while isinstance(env, gym.Wrapper):
             if isinstance(env, TimeLimit):
@@ -83,9 +99,11 @@ class ResumableEnv(gym.Wrapper):
         return None
 
 
-def _simulation_state(model: mujoco.MjModel, data: mujoco.MjData) -> dict[str, torch.Tensor]:
-    integration = np.empty(mujoco.mj_stateSize(model, _INTEGRATION_STATE))
-    mujoco.mj_getState(model, data, integration, _INTEGRATION_STATE)
+def _simulation_state(model: Any, data: Any) -> dict[str, torch.Tensor]:
+    mujoco = import_mujoco()
+    kind = mujoco.mjtState.mjSTATE_INTEGRATION
+    integration = np.empty(mujoco.mj_stateSize(model, kind))
+    mujoco.mj_getState(model, data, integration, kind)
     # The next step follows from the integration state alone, but rewards and observations also
     # read derived arrays (body positions, contact forces) that MuJoCo leaves half a step behind.
     # What has a size in fresh data is what does not depend on the contacts of the moment.
@@ -101,28 +119,28 @@ def _simulation_state(model: mujoco.MjModel, data: mujoco.MjData) -> dict[str, t
     return {"integration": torch.from_numpy(integration), **arrays}
 
 
-def _load_simulation_state(
-    model: mujoco.MjModel, data: mujoco.MjData, state: dict[str, torch.Tensor]
-) -> None:
-    mujoco.mj_setState(model, data, state["integration"].numpy(), _INTEGRATION_STATE)
+def _load_simulation_state(model: Any, data: Any, state: dict[str, torch.Tensor]) -> None:
+    mujoco = import_mujoco()
+    kind = mujoco.mjtState.mjSTATE_INTEGRATION
+    mujoco.mj_setState(model, data, state["integration"].numpy(), kind)
     for name, value in state.items():
         if name != "integration":
             getattr(data, name)[...] = value.numpy()
 
 
 class EnvState:
-    """The state of all copies of a vectorised environment, for checkpoints."""
+    """The states of parallel environments, for checkpoints."""
 
     def __init__(self, env: GymWrapper) -> None:
         """Takes an environment made by `make_vector_env`."""
         self.copies: tuple[ResumableEnv, ...] = tuple(env.envs)
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns the states of the copies."""
+        """Returns the state of each."""
         return {"copies": [copy.state_dict() for copy in self.copies]}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restores the copies; build the collector after this, not before."""
+        """Restores them; build the collector after this, not before."""
         for copy, state in zip(self.copies, state_dict["copies"], strict=True):
             copy.load_state_dict(state)
 
@@ -150,22 +168,26 @@ def make_env(name: str, **kwargs: Any) -> gym.Env:
     return env
 
 
-def make_vector_env(name: str, num_envs: int, seed: int) -> GymWrapper:
-    """Builds `num_envs` copies of an environment that step together in this process.
+def make_vector_env(
+    name: str, num_envs: int, seed: int, *, max_steps: int | None = None
+) -> GymWrapper:
+    """Builds `num_envs` parallel environments that step together in this process.
 
-    The copies do not reset themselves: ("next", "observation") of a last step is the true final
+    They do not reset themselves: ("next", "observation") of a last step is the true final
     observation, and the collector starts the next episode.
 
     Args:
         name: A Gymnasium id.
-        num_envs: Number of copies; the batch size of the result is (num_envs,).
-        seed: The copies are seeded with seed, seed + 1, ...
+        num_envs: Number of environments; the batch size of the result is (num_envs,).
+        seed: They are seeded with seed, seed + 1, ...
+        max_steps: Length after which an episode is cut. Default: the task's own.
 
     Raises:
         RunError: See `make_env`.
     """
-    copies = [lambda: ResumableEnv(make_env(name))] * num_envs
-    env = GymWrapper(SyncVectorEnv(copies, autoreset_mode=AutoresetMode.DISABLED))
+    limit = {} if max_steps is None else {"max_episode_steps": max_steps}
+    members = [lambda: ResumableEnv(make_env(name, **limit))] * num_envs
+    env = GymWrapper(SyncVectorEnv(members, autoreset_mode=AutoresetMode.DISABLED))
     env.set_seed(seed)
     return env
 
@@ -193,6 +215,7 @@ def _check_spaces(name: str, env: gym.Env) -> None:
 def _quiet_construction() -> Iterator[None]:
     # The paper's tasks are the -v4 ones on purpose, their XML files predate MuJoCo 3, and the
     # networks take float32: none of these notices helps. Everything else is still shown.
+    mujoco = import_mujoco()
     previous = getattr(mujoco, "get_mju_user_warning", lambda: None)()  # new in MuJoCo 4
 
     def show(message: str) -> None:

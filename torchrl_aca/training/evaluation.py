@@ -9,11 +9,13 @@ from pathlib import Path
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, GymWrapper
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import RandomPolicy
 
-from torchrl_aca.training.envs import make_env
-from torchrl_aca.training.errors import RunError
+from torchrl_aca.errors import RunError
+from torchrl_aca.training.config import Eval, RunConfig
+from torchrl_aca.training.envs import make_env, make_vector_env
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
@@ -30,17 +32,34 @@ def evaluation_mode(seed: int) -> Iterator[None]:
         yield
 
 
-def evaluate(policy: Policy, env: EnvBase, seed: int, device: torch.device) -> dict[str, float]:
-    """Runs exactly one whole episode in every copy of `env`.
+def make_eval_env(name: str, settings: Eval) -> GymWrapper:
+    """Builds the environments of the evaluation, one for each episode.
 
-    The copies are seeded anew, so the result depends on the policy and the seed alone. A copy that
-    has finished goes on until the last one has, but what it earns then is not counted: stopping at
-    the first end instead would cut the episodes of the others short.
+    Raises:
+        RunError: If episodes might never end, or see `make_env`.
+    """
+    env = make_vector_env(
+        name, settings.episodes, settings.seed, max_steps=settings.max_steps
+    )
+    if env.envs[0].time_limit is None:
+        raise RunError(
+            f"{name} has no time limit, so an evaluation of it might never end; expected one. Give "
+            "the length after which the evaluation cuts an episode, as in eval.max_steps=1000."
+        )
+    return env
+
+
+def evaluate(policy: Policy, env: EnvBase, seed: int, device: torch.device) -> dict[str, float]:
+    """Runs exactly one whole episode in each of the parallel environments.
+
+    They are seeded anew, so the result depends on the policy and the seed alone. One that has
+    finished goes on until the last one has, but what it earns then is not counted: stopping at the
+    first end instead would cut the episodes of the others short.
 
     Args:
         policy: Maps a TensorDict with "observation" to one with "action".
         env: Environment of batch size (num_episodes,); never the one that is trained on.
-        seed: First seed of the copies.
+        seed: First seed of the environments, and the one of the policy's draws.
         device: Device of the policy.
 
     Returns:
@@ -100,3 +119,16 @@ def record_video(
             f"{error}. Try MUJOCO_GL=egl (needs libEGL) or MUJOCO_GL=osmesa (needs libOSMesa), and "
             "pip install 'imageio[ffmpeg]'. The trained agent is safe in the checkpoints."
         ) from error
+
+
+def report_extras(
+    cfg: RunConfig, run_dir: Path, policy: Policy, env: EnvBase, device: torch.device
+) -> None:
+    """Adds, where asked for, the return of a random policy and a video of the trained one."""
+    if cfg.eval.random:
+        result = evaluate(RandomPolicy(env.action_spec), env, cfg.eval.seed, torch.device("cpu"))
+        print(f"a random policy on the same seeds: {result['return_mean']:.1f}")
+    if cfg.video.enabled:
+        path = run_dir / "video.mp4"
+        record_video(policy, cfg.env.name, path, cfg.eval.seed, device)
+        print(f"video: {path}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 import sys
 from collections.abc import Mapping
@@ -14,7 +15,9 @@ from tensordict import TensorDictBase
 from torchrl.record.loggers import get_logger
 from tqdm import tqdm
 
-from torchrl_aca.training.errors import RunError
+from torchrl_aca.errors import RunError
+from torchrl_aca.training.config import Logger
+from torchrl_aca.training.files import write_text
 
 
 class MetricMeans:
@@ -59,22 +62,23 @@ class MetricMeans:
 class CsvTable:
     """A CSV file with one column per metric; columns may appear later than the first row."""
 
-    def __init__(self, path: Path, last_update: int | None = None) -> None:
+    def __init__(self, path: Path, until: Mapping[str, int] | None = None) -> None:
         """Opens a table.
 
         Args:
             path: The file.
-            last_update: Keep the rows of an earlier sitting up to this update; None starts anew.
+            until: Keep the rows of an earlier session in which no column of these has a larger
+                value; None starts anew.
         """
         self.path = path
         self.columns: list[str] = []
         self.rows: list[dict[str, Any]] = []
-        if last_update is not None and path.is_file():
+        if until is not None and path.exists():
             with open(path, newline="") as file:
                 reader = csv.DictReader(file)
                 self.columns = list(reader.fieldnames or [])
-                self.rows = [row for row in reader if int(row["updates"]) <= last_update]
-            self._rewrite()
+                self.rows = [row for row in reader if not _is_later(row, until)]
+        self._rewrite()
 
     def append(self, row: Mapping[str, Any]) -> None:
         """Adds a row and writes it at once."""
@@ -87,10 +91,19 @@ class CsvTable:
                 csv.DictWriter(file, self.columns).writerow(row)
 
     def _rewrite(self) -> None:
-        with open(self.path, "w", newline="") as file:
-            writer = csv.DictWriter(file, self.columns)
-            writer.writeheader()
-            writer.writerows(self.rows)
+        """Replaces the file, so that a kill leaves the rows that were there."""
+        text = io.StringIO(newline="")
+        writer = csv.DictWriter(text, self.columns)
+        writer.writeheader()
+        writer.writerows(self.rows)
+        write_text(self.path, text.getvalue())
+
+
+def _is_later(row: Mapping[str, str | None], until: Mapping[str, int]) -> bool:
+    try:
+        return any(int(row.get(name) or 0) > last for name, last in until.items())
+    except ValueError:  # half a row, written by a process that was killed
+        return True
 
 
 class RunLogger:
@@ -100,17 +113,22 @@ class RunLogger:
         self,
         run_dir: Path,
         config: Mapping[str, Any],
-        last_update: int | None = None,
+        until: Mapping[str, int] | None = None,
     ) -> None:
         """Opens the tables of a run and the second logger that `config["logger"]` names.
+
+        Args:
+            run_dir: The run's directory.
+            config: The whole configuration.
+            until: Where a resumed run goes on: updates and frames; None for a new one.
 
         Raises:
             RunError: If wandb is to be online and nobody is logged in.
         """
         settings = config["logger"]
         self.tables = {
-            "metrics": CsvTable(run_dir / "metrics.csv", last_update),
-            "eval": CsvTable(run_dir / "eval.csv", last_update),
+            "metrics": CsvTable(run_dir / "metrics.csv", until),
+            "eval": CsvTable(run_dir / "eval.csv", until),
         }
         self.second = None
         if settings["backend"] == "tensorboard":
@@ -132,12 +150,21 @@ class RunLogger:
                 },
             )
 
-    def log(self, table: str, updates: int, frames: int, values: Mapping[str, float]) -> None:
-        """Adds a row to "metrics" or "eval"."""
-        self.tables[table].append({"updates": updates, "frames": frames, **values})
+    def log(
+        self, table: str, axes: Mapping[str, int], step: int, values: Mapping[str, float]
+    ) -> None:
+        """Adds a row to "metrics" or "eval".
+
+        Args:
+            table: The table's name.
+            axes: Updates and frames: the first columns.
+            step: Updates of all phases, by which the second logger orders its rows.
+            values: The other columns.
+        """
+        self.tables[table].append({**axes, **values})
         if self.second is not None:
-            numbers = {f"{table}/{name}": value for name, value in values.items()}
-            self.second.log_metrics({**numbers, f"{table}/frames": frames}, step=updates)
+            shown = {**values, "frames": axes["frames"]}
+            self.second.log_metrics({f"{table}/{k}": v for k, v in shown.items()}, step=step)
 
     def close(self) -> None:
         """Ends a wandb run; the CSV files need nothing."""
@@ -148,13 +175,13 @@ class RunLogger:
                 break
 
 
-def require_wandb_login(settings: Mapping[str, Any]) -> None:
+def require_wandb_login(settings: Logger) -> None:
     """Checks, before any long work, that wandb can be reached without a question at the terminal.
 
     Raises:
         RunError: If wandb is missing or nobody is logged in.
     """
-    if settings["backend"] != "wandb" or settings["wandb_mode"] == "offline":
+    if settings.backend != "wandb" or settings.wandb_mode == "offline":
         return
     try:
         import wandb

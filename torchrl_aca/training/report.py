@@ -13,6 +13,9 @@ from typing import Any
 
 import torch
 
+from torchrl_aca.training.files import write_text
+
+UPDATES = ("updates", "offline_updates")  # columns of the tables
 PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "mujoco", "numpy", "hydra-core")
 
 
@@ -63,7 +66,7 @@ def write_card(
 ) -> None:
     """Writes card.md: what was run, on what, what came out, and whatever `facts` adds."""
     last = evaluations[-1]
-    info = json.loads((run_dir / "versions.json").read_text())
+    info = _stored_versions(run_dir)
     score = last.get("normalized_score")
     scores = {} if score is None else {"normalised score": f"{float(score):.1f}"}
     rows = {
@@ -72,8 +75,8 @@ def write_card(
         "seed": config["seed"],
         "updates": last["updates"],
         "environment frames": f"{last['frames']} (warm-up included)",
-        "final return": f"{float(last['return_mean']):.1f} ± {float(last['return_std']):.1f} "
-        f"(mean ± std of {float(last['num_episodes']):.0f} episodes)",
+        "final return": f"{float(last['return_mean']):.1f} ± {standard_error(last):.1f} "
+        f"(mean ± standard error of {float(last['num_episodes']):.0f} episodes)",
         **scores,
         **facts,
         "wall-clock time": f"{seconds / 60:.1f} min",
@@ -86,17 +89,31 @@ def write_card(
         "Run again: the whole configuration is in `config.yaml`, the evaluations are in "
         "`eval.csv`, the training metrics in `metrics.csv`.\n\n![learning curve](curve.png)\n"
     )
-    (run_dir / "card.md").write_text(text)
+    write_text(run_dir / "card.md", text)
+
+
+def _stored_versions(run_dir: Path) -> dict[str, Any]:
+    """What a run began with; nothing where the file has been lost since."""
+    try:
+        return json.loads((run_dir / "versions.json").read_text())
+    except (OSError, ValueError):
+        return {"versions": "lost: versions.json is missing or damaged"}
+
+
+def standard_error(evaluation: Mapping[str, Any]) -> float:
+    """Returns the standard error of `return_mean`, from the spread over the episodes."""
+    return float(evaluation["return_std"]) / float(evaluation["num_episodes"]) ** 0.5
 
 
 def plot_curve(run_dir: Path, title: str, evaluations: Sequence[Mapping[str, Any]]) -> None:
-    """Draws the evaluation return over updates and frames to curve.png."""
+    """Draws the evaluation return over the updates of both phases to curve.png."""
     from matplotlib.figure import Figure
 
-    updates, frames, mean, std = (
+    frames, mean, std = (
         [float(row[name]) for row in evaluations]
-        for name in ("updates", "frames", "return_mean", "return_std")
+        for name in ("frames", "return_mean", "return_std")
     )
+    updates = [sum(float(row.get(n) or 0) for n in UPDATES) for row in evaluations]
     figure = Figure(figsize=(6, 4), layout="constrained")
     axes = figure.subplots()
     axes.plot(updates, mean, marker="o", markersize=3)

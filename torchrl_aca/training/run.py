@@ -1,272 +1,333 @@
-"""A run: its directory, its log, its checkpoints, and how it ends."""
+"""A run: its counters, phases and randomness, its directory and log, and how it ends."""
 
 from __future__ import annotations
 
+import io
 import json
-import signal
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from fractions import Fraction
 from pathlib import Path
-from types import FrameType
+from types import TracebackType
 from typing import Any
 
-from filelock import FileLock, Timeout
-from omegaconf import DictConfig, OmegaConf
+import torch
+from omegaconf import OmegaConf
 from tensordict import TensorDictBase
+from torchrl.data import ReplayBuffer
 
-from torchrl_aca.training.agent import Stateful
-from torchrl_aca.training.checkpoint import (
-    Counters,
-    list_checkpoints,
-    save_checkpoint,
-    updates_of,
-)
-from torchrl_aca.training.data import check_finite
-from torchrl_aca.training.errors import RunError
-from torchrl_aca.training.logging import ProgressBar, RunLogger
+from torchrl_aca.errors import RunError
+from torchrl_aca.replay import TRANSITION_KEYS, BufferState
+from torchrl_aca.training.agent import Agent, Stateful
+from torchrl_aca.training.checkpoint import Counters, restore, save_checkpoint
+from torchrl_aca.training.collection import BadDataError, Collection
+from torchrl_aca.training.config import RunConfig
+from torchrl_aca.training.files import write_text
+from torchrl_aca.training.logging import MetricMeans, ProgressBar, RunLogger
+from torchrl_aca.training.randomness import RandomState
 from torchrl_aca.training.report import plot_curve, versions, write_card
+from torchrl_aca.training.run_dir import lock, make_run_dir, require_newest
+from torchrl_aca.training.signals import StopSignal
 
 Metrics = Mapping[str, float]
 
 
-def make_run_dir(cfg: DictConfig) -> Path:
-    """Creates the directory of a new run.
-
-    Raises:
-        RunError: If `run_dir` already holds a run.
-    """
-    stamp = time.strftime("%Y%m%d-%H%M%S")
-    name = f"{cfg.env.name.split(':')[-1]}-{cfg.algo.name}-s{cfg.seed}-{stamp}"
-    run_dir = Path(cfg.run_dir or Path("runs") / name)
-    if (run_dir / "config.yaml").exists():
-        raise RunError(
-            f"run_dir={run_dir} already holds a run; expected a new directory. Give another "
-            f"run_dir, or go on with resume={run_dir}."
-        )
-    run_dir.mkdir(parents=True, exist_ok=True)
-    return run_dir
-
-
-def lock(run_dir: Path) -> FileLock:
-    """Takes a run directory for this process; the system gives it back when the process ends.
-
-    The file stays: to remove it would let two processes lock two files of one name.
-
-    Raises:
-        RunError: If another process has it.
-    """
-    found = FileLock(run_dir / ".lock")
-    try:
-        found.acquire(blocking=False)
-    except Timeout:
-        raise RunError(
-            f"{run_dir}: another process is at work on this run. Wait for its end, or stop it with "
-            "Ctrl-C first: it leaves a checkpoint."
-        ) from None
-    return found
-
-
-def require_newest(run_dir: Path, updates: int) -> None:
-    """Raises `RunError` if a checkpoint newer than the one just read has come meanwhile."""
-    newest = list_checkpoints(run_dir / "checkpoints")[-1]
-    if updates_of(newest) != updates:
-        raise RunError(
-            f"{run_dir} went on to {newest.name} while its checkpoint of {updates} updates was "
-            "read. Resume it again."
-        )
-
-
-def has_reached(evaluations: Sequence[Mapping[str, Any]], stop_return: float | None) -> bool:
-    """Tells whether the latest two evaluations have averaged `stop_return`."""
-    latest = [float(row["return_mean"]) for row in evaluations[-2:]]
-    return stop_return is not None and len(latest) == 2 and sum(latest) / 2 >= stop_return
+class _Stopped(Exception):
+    """Leaves the loops after a signal in a phase that has no end of an iteration."""
 
 
 class Run:
     """Keeps the books of a training loop; a context manager. One process at a time has a directory.
 
+    Entering it evaluates the untrained policy, leaving it writes the last checkpoint, the card and
+    the curve. A run that was stopped in any phase goes on there, on a CPU bit for bit.
+
     Attributes:
         dir: The run directory.
-        counters: Updates, frames and seconds; the loop counts the first two.
-        stopping: Whether Ctrl-C or SIGTERM has arrived: leave the loop after this iteration.
+        counters: Updates of both phases, and seconds.
+        completed: Whether all updates were made.
     """
 
     def __init__(
         self,
-        cfg: DictConfig,
-        parts: Mapping[str, Stateful],
-        counters: Counters,
-        resumed: bool,
-        script: str,
+        cfg: RunConfig,
+        agent: Agent,
+        buffer: Any,
+        collection: Collection,
+        evaluate: Callable[[], Metrics],
+        checkpoint: dict[str, Any] | None = None,
+        *,
+        device: torch.device | str = "cpu",
+        script: str = "",
         facts: Mapping[str, object] | None = None,
     ) -> None:
         """Opens a new run directory, or the one in `cfg.resume`.
 
         Args:
             cfg: The whole configuration.
-            parts: Everything that a checkpoint holds.
-            counters: One of the parts.
-            resumed: Whether the parts come from a checkpoint.
+            agent: What is trained.
+            buffer: A replay buffer, or a mixture that saves itself; `sample()` gives a batch.
+            collection: Where experience comes from.
+            evaluate: Evaluates the policy.
+            checkpoint: What `read_checkpoint` returned, to go on from.
+            device: Where batches go.
             script: The recipe that can go on with the run.
             facts: More rows for the card.
 
         Raises:
-            RunError: If a new run's directory holds a run, another process is at work in it, or has
-                gone on with it since its checkpoint was read.
+            RunError: If the checkpoint does not fit or needs no more updates; if a new run's
+                directory holds a run, another process is at work in it, or has gone on with it
+                since its checkpoint was read; or if the state of a part cannot be saved.
         """
-        self.dir = Path(cfg.resume) if resumed else make_run_dir(cfg)
-        self.parts, self.counters, self.facts = parts, counters, facts or {}
-        self.script = script
+        self.cfg, self.agent, self.collection = cfg, agent, collection
+        self.counters, self.means, self.completed = Counters(), MetricMeans(), False
+        self.script, self.facts = script, facts or {}
+        self._evaluate, self._device = evaluate, device
+        self.parts: dict[str, Stateful] = {
+            **{f"agent.{name}": part for name, part in agent.state.items()},
+            "buffer": as_stateful(buffer, agent),
+            "collection": collection,
+            "means": self.means,
+            "counters": self.counters,
+            "random": RandomState(),  # the last one, because restoring the others may draw
+        }
+        if cfg.optim.offline_updates and agent.offline_update is None:
+            raise RunError(
+                f"optim.offline_updates={cfg.optim.offline_updates}: expected 0, because "
+                f"algo={cfg.algo.name} has no offline phase. Leave it out."
+            )
+        if checkpoint is not None:
+            self._restore(checkpoint)
+        notes = self._savable_parts()
+        name = f"{cfg.env.name.split(':')[-1]}-{cfg.algo.name}-s{cfg.seed}"
+        resumed = checkpoint is not None
+        self.dir = Path(cfg.resume or "") if resumed else make_run_dir(cfg.run_dir, name)
         self._lock = lock(self.dir)
         try:
-            self._open(cfg, resumed)
+            self._open(resumed, notes)
+        except OSError as error:
+            self._lock.release()
+            raise RunError(f"{self.dir} cannot be written: {error}. Mend that.") from error
         except BaseException:
             self._lock.release()
             raise
 
-    def _open(self, cfg: DictConfig, resumed: bool) -> None:
+    # --- beginning --------------------------------------------------------------------------------
+
+    def _restore(self, checkpoint: dict[str, Any]) -> None:
+        done, total = checkpoint["parts"]["counters"].get("updates"), self.cfg.optim.total_updates
+        restore(self.parts, checkpoint["parts"])
+        if self.counters.updates >= total:
+            raise RunError(
+                f"resume={self.cfg.resume}: the run already has {done} updates; expected "
+                f"optim.total_updates above that, got {total}. Raise it."
+            )
+
+    def _savable_parts(self) -> list[str]:
+        """Takes the state of every part once, so that no part fails at the first checkpoint."""
+        notes = []
+        if why := self.collection.require_savable():
+            notes.append(
+                f"the state of {self.cfg.env.name} cannot be saved ({why}): checkpoints leave it "
+                "out, and a resumed run begins new episodes"
+            )
+        for name, part in self.parts.items():
+            try:
+                torch.save(part.state_dict(), io.BytesIO())
+            except Exception as error:  # parts are foreign code
+                raise RunError(
+                    f"the state of {name!r} cannot be saved ({type(error).__name__}: {error}), so "
+                    "this run would die at its first checkpoint. Mend its state_dict()."
+                ) from error
+        return notes
+
+    def _open(self, resumed: bool, notes: Sequence[str]) -> None:
         """Writes what describes the run, and opens its log."""
+        counters, cfg = self.counters, self.cfg
         if resumed:
-            require_newest(self.dir, self.counters.updates)
+            require_newest(self.dir, counters.total)
         else:
-            text = json.dumps(versions(), indent=2)
-            (self.dir / "versions.json").write_text(text + "\n")
+            write_text(self.dir / "versions.json", json.dumps(versions(), indent=2) + "\n")
         # The run as it is now: a resume may have changed the number of updates or the logger.
-        self.config = {**OmegaConf.to_container(cfg, resolve=True), "resume": None}
-        (self.dir / "config.yaml").write_text(OmegaConf.to_yaml(self.config))
-        self._saved: int | None = None  # frames at the latest checkpoint of this sitting
-        updates = self.counters.updates
-        self.logger = RunLogger(self.dir, self.config, updates if resumed else None)
-        self.bar = ProgressBar(cfg.optim.total_updates, updates)
-        self._signal = StopSignal()
-        self._lap = (time.perf_counter(), updates, self.counters.frames)
-        self.bar.write(f"run directory: {self.dir}")
-        if self.counters.frames < (warmup := cfg.collector.init_random_frames):
-            self.bar.write(f"the first {warmup} frames are random actions, without updates")
+        self.config = {**cfg.model_dump(), "resume": None}
+        write_text(self.dir / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(self.config)))
+        self._saved: tuple[int, int] | None = None  # the latest checkpoint of this session
+        self.logger = RunLogger(self.dir, self.config, self._axes() if resumed else None)
+        total = cfg.optim.offline_updates + cfg.optim.total_updates
+        self.bar = ProgressBar(total, counters.total)
+        self._signal = StopSignal(self.bar.write)
+        self._since = counters.updates
+        self._lap = (time.perf_counter(), counters.total, self.collection.frames)
+        for line in (f"run directory: {self.dir}", *notes, *self._outlook()):
+            self.bar.write(line)
+
+    def _outlook(self) -> Iterator[str]:
+        """What the user will wait for before the first update shows."""
+        settings, optim = self.cfg.collector, self.cfg.optim
+        if (left := optim.offline_updates - self.counters.offline_updates) > 0:
+            yield f"the first {left} updates are made on the data set alone"
+        if self.collection.frames < settings.warmup_frames:
+            who = "random actions" if settings.warmup == "random" else "actions of the policy"
+            yield f"the first {settings.warmup_frames} frames are {who}, without updates"
 
     def __enter__(self) -> Run:
-        """Starts to listen for signals."""
+        """Starts to listen for signals; evaluates the policy that a new run begins with."""
         self._signal.__enter__()
+        if not self.logger.tables["eval"].rows:
+            self.log_evaluation()
         return self
 
-    def __exit__(self, *exc_info: object) -> None:
-        """Closes the log."""
-        self._signal.__exit__(*exc_info)
-        try:
-            self.bar.close()
-            self.logger.close()
-        finally:
-            self._lock.release()
+    # --- the loop ---------------------------------------------------------------------------------
 
     @property
     def stopping(self) -> bool:
         """Whether a signal asks to stop."""
         return self._signal.received is not None
 
-    def check(self, data: TensorDictBase) -> None:
-        """Raises `RunError` for NaN in collected data, after a checkpoint without that data."""
-        try:
-            check_finite(data, self.config["env"]["name"], self.counters.frames)
-        except RunError as error:
-            # The environments cannot be trusted any more: the resumed run begins new episodes.
-            path = self.save(without=("env", "episodes"))
-            raise RunError(f"{error} What came before is in {path}.") from None
+    def offline_phase(self, buffer: Any) -> Iterator[TensorDictBase]:
+        """Yields the batches of the offline phase that are left; none for a method without one."""
+        counters, last = self.counters, self.cfg.optim.offline_updates
+        while counters.offline_updates < last:
+            since = counters.offline_updates
+            yield buffer.sample().to(self._device)
+            counters.offline_updates += 1
+            self._book(since, counters.offline_updates, counters.offline_updates == last, last)
+            if self.stopping:
+                raise _Stopped
 
-    def log_metrics(self, values: Metrics) -> None:
-        """Adds a row of training metrics, with the time and the speed."""
-        values = {**values, **self._speed()}
-        self.logger.log("metrics", self.counters.updates, self.counters.frames, values)
-        self.bar.show_metrics(self.counters.updates, self.counters.frames, values)
+    def due(self, buffer: Any) -> Iterator[TensorDictBase]:
+        """Yields a batch for each update that the frames so far call for."""
+        self._since = self.counters.updates
+        due = updates_due(self.cfg, self.collection.frames)
+        while self.counters.updates < due:
+            yield buffer.sample().to(self._device)
+            self.counters.updates += 1
 
-    def log_evaluation(self, values: Metrics) -> None:
-        """Adds a row of evaluation results."""
-        self.logger.log("eval", self.counters.updates, self.counters.frames, values)
-        self.bar.show_evaluation(self.counters.updates, self.counters.frames, values)
+    def add(self, metrics: TensorDictBase) -> None:
+        """Takes the metrics of an update."""
+        self.means.add(metrics)
 
-    def end_iteration(
-        self, since: int, metrics: Callable[[], Metrics], evaluation: Callable[[], Metrics]
-    ) -> bool:
-        """Logs, evaluates and saves what is due, and tells whether all updates are made.
+    def end_iteration(self) -> bool:
+        """Logs, evaluates and saves what is due, and tells whether to leave the loop."""
+        cfg, updates = self.cfg, self.counters.updates
+        self.completed = updates >= cfg.optim.total_updates
+        self._book(self._since, updates, self.completed)
+        rows = self.logger.tables["eval"].rows
+        if passed(cfg.eval.interval, self._since, updates):
+            self.completed |= has_reached(rows, cfg.eval.stop_return)
+        return self.completed or self.stopping
 
-        Args:
-            since: Updates that had been made before this iteration.
-            metrics: Gives the training metrics; called when a row of them is due.
-            evaluation: Evaluates the policy; called when that is due.
-        """
-        cfg = self.config
-        last = self.counters.updates >= cfg["optim"]["total_updates"]
-        if self.counters.passed(cfg["logger"]["interval"], since):
-            self.log_metrics(metrics())
-        if self.counters.passed(cfg["eval"]["interval"], since) or last:
-            self.log_evaluation(evaluation())
-            last = last or has_reached(self.logger.tables["eval"].rows, cfg["eval"]["stop_return"])
-        if self.counters.passed(cfg["checkpoint"]["interval"], since):
+    def _book(self, since: int, now: int, last: bool, last_offline: int | None = None) -> None:
+        """What is due after the updates from `since` to `now` of a phase, which may be its last."""
+        cfg = self.cfg
+        if passed(cfg.logger.interval, since, now) or now == last_offline:
+            self.log_metrics()
+        if passed(cfg.eval.interval, since, now) or last:
+            self.log_evaluation()
+        if passed(cfg.checkpoint.interval, since, now) or now == last_offline:
             self.save()
-        self.bar.advance(self.counters.updates)
-        return last
+        self.bar.advance(self.counters.total)
+
+    # --- what it leaves ---------------------------------------------------------------------------
+
+    def _axes(self) -> dict[str, int]:
+        """Where the run is, as the first columns of its tables."""
+        axes = {"updates": self.counters.updates, "frames": self.collection.frames}
+        if self.cfg.optim.offline_updates:
+            axes["offline_updates"] = self.counters.offline_updates
+        return axes
+
+    def log_metrics(self) -> None:
+        """Adds a row of training metrics, with the time and the speed."""
+        values = {**self.collection.episodes.metrics(), **self.means.pop(), **self._speed()}
+        self.logger.log("metrics", self._axes(), self.counters.total, values)
+        self.bar.show_metrics(self.counters.total, self.collection.frames, values)
+
+    def log_evaluation(self) -> None:
+        """Evaluates the policy and adds a row of the results."""
+        self._signal.activity = "evaluation"
+        values = self._evaluate()
+        self._signal.activity = "iteration"
+        self.logger.log("eval", self._axes(), self.counters.total, values)
+        self.bar.show_evaluation(self.counters.total, self.collection.frames, values)
 
     def _speed(self) -> dict[str, float]:
         then, updates, frames = self._lap
         now = time.perf_counter()
-        self._lap = (now, self.counters.updates, self.counters.frames)
+        self._lap = (now, self.counters.total, self.collection.frames)
         self.counters.seconds += now - then
         return {
             "seconds": self.counters.seconds,
-            "frames_per_second": (self.counters.frames - frames) / (now - then),
-            "updates_per_second": (self.counters.updates - updates) / (now - then),
+            "frames_per_second": (self.collection.frames - frames) / (now - then),
+            "updates_per_second": (self.counters.total - updates) / (now - then),
         }
 
-    def save(self, without: tuple[str, ...] = ()) -> Path:
-        """Writes a checkpoint of all parts but those named."""
-        parts = {name: part for name, part in self.parts.items() if name not in without}
-        keep_last = self.config["checkpoint"]["keep_last"]
-        updates = self.counters.updates
-        self._saved = self.counters.frames
-        return save_checkpoint(self.dir / "checkpoints", parts, self.config, updates, keep_last)
+    def save(self) -> Path:
+        """Writes a checkpoint of all parts."""
+        self._saved = (self.counters.total, self.collection.frames)
+        directory, keep_last = self.dir / "checkpoints", self.cfg.checkpoint.keep_last
+        return save_checkpoint(directory, self.parts, self.config, self.counters.total, keep_last)
 
-    def finish(self, completed: bool) -> None:
-        """Writes the last checkpoint, the card and the curve, and says how it went.
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> bool:
+        """Writes the last checkpoint, the card and the curve, and closes the log."""
+        try:
+            if error is None or isinstance(error, _Stopped):
+                self._finish()
+            elif isinstance(error, BadDataError):
+                self.collection.savable = False  # the environments cannot be trusted any more
+                raise RunError(
+                    f"{self.cfg.env.name}: {error} What came before is in {self.save()}."
+                ) from None
+        finally:
+            self._signal.__exit__()
+            self.bar.close()
+            self.logger.close()
+            self.collection.close()
+            self._lock.release()
+        return isinstance(error, _Stopped)
 
-        Args:
-            completed: Whether all updates were made; False after a signal.
-        """
+    def _finish(self) -> None:
         self._speed()
-        if self._saved != self.counters.frames:
+        if self._saved != (self.counters.total, self.collection.frames):
             self.save()
         rows = self.logger.tables["eval"].rows
-        title = f"{self.config['algo']['name']} on {self.config['env']['name']}"
+        title = f"{self.cfg.algo.name} on {self.cfg.env.name}"
         write_card(self.dir, self.config, rows, self.counters.seconds, self.facts)
         plot_curve(self.dir, title, rows)
-        if completed:
+        if self.completed:
             before, after = (float(row["return_mean"]) for row in (rows[0], rows[-1]))
             self.bar.write(f"mean evaluation return: before {before:.1f}, after {after:.1f}")
         else:
             self.bar.write(
-                f"stopped by {self._signal.received} after {self.counters.updates} updates; "
-                f"go on with: python {self.script} resume={self.dir}"
+                f"stopped by {self._signal.received or 'the loop'} after {self.counters.total} "
+                f"updates; go on with: python {self.script} resume={self.dir}"
             )
 
 
-class StopSignal:
-    """Turns the first Ctrl-C or SIGTERM into a wish to stop; a second one stops at once."""
+def as_stateful(buffer: Any, agent: Agent) -> Stateful:
+    """Returns what saves a buffer: TorchRL's own state would hold the empty part as well."""
+    if not isinstance(buffer, ReplayBuffer):
+        return buffer
+    return BufferState(buffer, (*TRANSITION_KEYS, *agent.extra_keys))
 
-    SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
-    def __init__(self) -> None:
-        """Does nothing until it is entered."""
-        self.received: str | None = None
+def updates_due(cfg: RunConfig, frames: int) -> int:
+    """Returns how many updates belong to so many frames: exact, with no remainder to carry."""
+    trained = max(0, frames - cfg.collector.warmup_frames)
+    return int(trained * Fraction(str(cfg.optim.utd_ratio)))
 
-    def __enter__(self) -> StopSignal:
-        """Installs the handlers."""
-        self._previous = {number: signal.signal(number, self._handle) for number in self.SIGNALS}
-        return self
 
-    def __exit__(self, *exc_info: object) -> None:
-        """Puts the earlier handlers back."""
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)
+def passed(interval: int, since: int, now: int) -> bool:
+    """Tells whether a multiple of `interval` lies in the updates after `since`, up to `now`."""
+    return since // interval < now // interval
 
-    def _handle(self, number: int, frame: FrameType | None) -> None:
-        self.received = signal.Signals(number).name
-        for each, handler in self._previous.items():
-            signal.signal(each, handler)
+
+def has_reached(evaluations: Sequence[Mapping[str, Any]], stop_return: float | None) -> bool:
+    """Tells whether the latest two evaluations have averaged `stop_return`."""
+    latest = [float(row["return_mean"]) for row in evaluations[-2:]]
+    return stop_return is not None and len(latest) == 2 and sum(latest) / 2 >= stop_return

@@ -1,4 +1,4 @@
-"""The tanh-squashed Gaussian policy that several algorithms share."""
+"""The tanh-squashed Gaussian policy that several algorithms share, and its units."""
 
 from __future__ import annotations
 
@@ -21,6 +21,11 @@ class BoundedNormalParams(nn.Module):
         """Returns mean and standard deviation, (..., A) each."""
         mean, log_std = params.chunk(2, dim=-1)
         return mean, log_std.clamp(*self.bounds).exp()
+
+
+def log_half_range(action_spec: Bounded) -> float:
+    """Returns what the entropy in env units is above that of the same actions in [-1, 1]."""
+    return ((action_spec.space.high - action_spec.space.low) / 2).log().sum().item()
 
 
 def make_gaussian_policy(

@@ -13,7 +13,8 @@ from tensordict.utils import NestedKey, unravel_key
 from torchrl.data import ReplayBuffer
 
 from torchrl_aca.checks import check_at_least
-from torchrl_aca.offline.rows import (
+from torchrl_aca.replay.buffer import BufferState
+from torchrl_aca.replay.rows import (
     Layout,
     fingerprint,
     layout_of,
@@ -21,7 +22,6 @@ from torchrl_aca.offline.rows import (
     require_plain,
     rows_of,
 )
-from torchrl_aca.training.data import BufferState
 
 __all__ = ["MixedReplayBuffer"]
 
@@ -75,7 +75,7 @@ class MixedReplayBuffer:
 
     Examples:
         >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-        >>> from torchrl_aca.offline import MixedReplayBuffer
+        >>> from torchrl_aca.replay import MixedReplayBuffer
         >>> online = TensorDictReplayBuffer(storage=LazyTensorStorage(1000))
         >>> buffer = MixedReplayBuffer(data, online, offline_fraction=0.25, batch_size=8, seed=1)
         >>> indices = buffer.extend(data[:3])

@@ -3,30 +3,57 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import torch
-from gaussian_policy import make_gaussian_policy
-from omegaconf import DictConfig
+from pydantic import model_validator
 from tensordict import TensorDictBase
 from torch import nn
 from torchrl.envs import EnvBase
 from torchrl.modules import MLP, ValueOperator
 from torchrl.objectives import SACLoss, SoftUpdate
 
+from agents.gaussian_policy import log_half_range, make_gaussian_policy
 from torchrl_aca.training.acceleration import capture, compiled, make_adam
 from torchrl_aca.training.agent import Agent
+from torchrl_aca.training.config import Optim, Positive, Section, Widths
 
 
-def make_sac(cfg: DictConfig, env: EnvBase, device: torch.device) -> Agent:
+class SACSettings(Section):
+    """The section `sac`."""
+
+    num_cells: Widths
+    activation: str
+    alpha_init: Positive
+    log_std_min: float
+    log_std_max: float
+    target_entropy_scale: float
+    reward_scale: Positive
+
+    @model_validator(mode="after")
+    def _names(self) -> SACSettings:
+        kind = getattr(nn, self.activation, None)
+        if not (isinstance(kind, type) and issubclass(kind, nn.Module)):
+            self.refuse("activation", "the name of an activation in torch.nn, such as ReLU")
+        if self.log_std_max < self.log_std_min:
+            self.refuse("log_std_max", f"at least sac.log_std_min ({self.log_std_min})")
+        return self
+
+
+class SACOptim(Optim):
+    """The section `optim` of SAC."""
+
+    lr: Positive
+
+
+def make_sac(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
     """SAC with a tanh-squashed Gaussian, two critics and a learned temperature."""
     settings = cfg.sac
     action_spec = env.action_spec_unbatched
     observation_dim = env.observation_spec["observation"].shape[-1]
     action_dim = action_spec.shape[-1]
-    activation = getattr(nn, settings.activation, None)
-    if activation is None:
-        raise ValueError(f"sac.activation={settings.activation}: expected a class of torch.nn.")
-    mlp = {"num_cells": list(settings.num_cells), "activation_class": activation, "device": device}
+    activation = getattr(nn, settings.activation)
+    mlp = {"num_cells": settings.num_cells, "activation_class": activation, "device": device}
     policy = make_gaussian_policy(
         MLP(in_features=observation_dim, out_features=2 * action_dim, **mlp),
         action_spec,
@@ -39,14 +66,20 @@ def make_sac(cfg: DictConfig, env: EnvBase, device: torch.device) -> Agent:
         in_keys=["observation", "action"],
     )
     loss = SACLoss(
-        policy, critic, num_qvalue_nets=2, loss_function="l2", alpha_init=settings.alpha_init
+        policy,
+        critic,
+        num_qvalue_nets=2,
+        loss_function="l2",
+        alpha_init=settings.alpha_init,
+        # The policy's density is of actions in env units; the target is meant for [-1, 1].
+        target_entropy=-settings.target_entropy_scale * action_dim + log_half_range(action_spec),
     ).to(device)
     loss.make_value_estimator(gamma=cfg.optim.gamma)
     target_update = SoftUpdate(loss, tau=cfg.optim.tau)
-    optimizer = make_adam(loss.parameters(), cfg.optim.lr, cfg)
-    evaluate_loss = compiled(loss, cfg)
+    optimizer = make_adam(loss.parameters(), cfg.optim.lr, cfg.cudagraphs)
+    evaluate_loss = compiled(loss, cfg.compile)
 
-    @partial(capture, cfg=cfg)
+    @partial(capture, enabled=cfg.cudagraphs)
     def update(batch: TensorDictBase) -> TensorDictBase:
         batch = batch.copy()
         batch["next", "reward"] = settings.reward_scale * batch["next", "reward"]

@@ -1,54 +1,103 @@
-"""RLPD for `online_mujoco.py`: many critic steps for each step of actor and temperature."""
+"""RLPD for the recipes: many critic steps for each step of actor and temperature."""
 
 from __future__ import annotations
 
 from collections import deque
 from functools import partial
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import torch
-from gaussian_policy import make_gaussian_policy
-from omegaconf import DictConfig
+from pydantic import Field, model_validator
 from tensordict import TensorDict, TensorDictBase
 from torch import nn
 from torchrl.envs import EnvBase
 from torchrl.modules import MLP, ProbabilisticActor, ValueOperator
 from torchrl.objectives import SoftUpdate
 
+from agents.gaussian_policy import make_gaussian_policy
 from torchrl_aca.baselines import EnsembleMLP, EnsembleSACLoss
 from torchrl_aca.training.acceleration import capture, compiled, descend, make_adam
 from torchrl_aca.training.agent import Agent
 from torchrl_aca.training.checkpoint import Counters
+from torchrl_aca.training.config import Count, Optim, Positive, Section, Widths
 
 INITIALISERS = {"xavier_uniform": nn.init.xavier_uniform_, "orthogonal": nn.init.orthogonal_}
 
 
-def make_rlpd(cfg: DictConfig, env: EnvBase, device: torch.device) -> Agent:
+class RLPDSettings(Section):
+    """The section `rlpd`."""
+
+    num_cells: Widths
+    num_qvalue_nets: Annotated[int, Field(ge=1, le=1000)]
+    critic_layer_norm: bool
+    actor_layer_norm: bool
+    init: Literal["xavier_uniform", "orthogonal"]
+    gain: Positive
+    last_hidden_gain: Positive
+    log_std_min: float
+    log_std_max: float
+    subset_size: Count
+    subset_with_replacement: bool
+    entropy_backup: bool
+    actor_value: Literal["mean", "min"]
+    actor_interval: Count | None
+    num_actor_batches: Count | None
+    alpha_init: Positive
+    target_entropy_scale: float
+    temperature: Literal["exp", "softplus"]
+
+    @model_validator(mode="after")
+    def _sizes(self) -> RLPDSettings:
+        if self.subset_size > self.num_qvalue_nets:
+            self.refuse("subset_size", f"at most rlpd.num_qvalue_nets ({self.num_qvalue_nets})")
+        if self.log_std_max < self.log_std_min:
+            self.refuse("log_std_max", f"at least rlpd.log_std_min ({self.log_std_min})")
+        return self
+
+
+class Variant(Section):
+    """The section `variant`: whose code the settings are from."""
+
+    name: str
+
+
+class RLPDOptim(Optim):
+    """The section `optim` of RLPD."""
+
+    lr: Positive
+    actor_lr: Positive
+    alpha_lr: Positive
+
+
+def make_rlpd(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
     """RLPD; a call of its update is one critic step, on one batch.
 
     At every `rlpd.actor_interval`-th update follows a step of actor and temperature, on the states
-    of the last `rlpd.num_actor_batches` batches: one in the original, all of a round in WSRL's
-    version. WSRL's code has the offline rows of a round in half of its critic steps and the online
+    of the last `rlpd.num_actor_batches` batches: one in the original, all since the actor's last
+    step in WSRL's version. WSRL's code has the offline rows of a round in half of its critic steps and the online
     rows in the other half, because of the order in which it joins them; here every critic step
     takes a batch as the loop has sampled it.
     """
     settings, optim = cfg.rlpd, cfg.optim
     loss = make_rlpd_loss(cfg, env, device)
     target_update = SoftUpdate(loss, tau=optim.tau)
-    optimizer = make_adam(loss.qvalue_network_params.parameters(), optim.lr, cfg)
-    actor_optimizer = make_adam(loss.actor_network.parameters(), optim.actor_lr, cfg)
-    alpha_optimizer = make_adam([loss.raw_alpha], optim.alpha_lr, cfg)
-    recent, progress = RecentStates(settings.num_actor_batches, device), Counters()
-    actor_interval = settings.actor_interval  # not in the update: an interpolation takes its time
-    qvalue_loss, actor_loss = compiled(loss.qvalue_loss, cfg), compiled(loss.actor_loss, cfg)
+    optimizer = make_adam(loss.qvalue_network_params.parameters(), optim.lr, cfg.cudagraphs)
+    actor_optimizer = make_adam(loss.actor_network.parameters(), optim.actor_lr, cfg.cudagraphs)
+    alpha_optimizer = make_adam([loss.raw_alpha], optim.alpha_lr, cfg.cudagraphs)
+    # One actor step for each step of the environment, or for each update where those are rarer.
+    actor_interval = settings.actor_interval or max(1, round(optim.utd_ratio))
+    recent = RecentStates(settings.num_actor_batches or actor_interval, device)
+    progress = Counters()
+    qvalue_loss = compiled(loss.qvalue_loss, cfg.compile)
+    actor_loss = compiled(loss.actor_loss, cfg.compile)
 
-    @partial(capture, cfg=cfg)
+    @partial(capture, enabled=cfg.cudagraphs)
     def critic_step(batch: TensorDictBase) -> TensorDictBase:
         metrics = descend(qvalue_loss(batch), "loss_qvalue", optimizer)
         target_update.step()
         return metrics
 
-    @partial(capture, cfg=cfg)
+    @partial(capture, enabled=cfg.cudagraphs)
     def actor_step(states: TensorDictBase) -> TensorDictBase:
         states = states.copy()
         metrics = descend(actor_loss(states), "loss_actor", actor_optimizer)
@@ -103,7 +152,7 @@ class RecentStates:
         self.batches.extend(batch.to(self.device) for batch in state_dict["batches"])
 
 
-def make_rlpd_loss(cfg: DictConfig, env: EnvBase, device: torch.device) -> EnsembleSACLoss:
+def make_rlpd_loss(cfg: Any, env: EnvBase, device: torch.device) -> EnsembleSACLoss:
     """The policy, the critics and their loss."""
     settings = cfg.rlpd
     loss = EnsembleSACLoss(
@@ -121,10 +170,10 @@ def make_rlpd_loss(cfg: DictConfig, env: EnvBase, device: torch.device) -> Ensem
     return loss
 
 
-def make_policy(settings: DictConfig, env: EnvBase, device: torch.device) -> ProbabilisticActor:
+def make_policy(settings: RLPDSettings, env: EnvBase, device: torch.device) -> ProbabilisticActor:
     """The tanh-squashed Gaussian."""
     action_spec = env.action_spec_unbatched
-    num_cells = list(settings.num_cells)
+    num_cells = settings.num_cells
     norm = {}
     if settings.actor_layer_norm:
         kwargs = [{"normalized_shape": cells, "eps": 1e-6} for cells in num_cells]
@@ -146,12 +195,12 @@ def make_policy(settings: DictConfig, env: EnvBase, device: torch.device) -> Pro
     )
 
 
-def make_critics(settings: DictConfig, env: EnvBase, device: torch.device) -> ValueOperator:
+def make_critics(settings: RLPDSettings, env: EnvBase, device: torch.device) -> ValueOperator:
     """The ensemble of critics."""
     network = EnsembleMLP(
         env.observation_spec["observation"].shape[-1] + env.action_spec_unbatched.shape[-1],
         settings.num_qvalue_nets,
-        num_cells=list(settings.num_cells),
+        num_cells=settings.num_cells,
         layer_norm=settings.critic_layer_norm,
         device=device,
     )
@@ -159,12 +208,10 @@ def make_critics(settings: DictConfig, env: EnvBase, device: torch.device) -> Va
     return ValueOperator(network, in_keys=["observation", "action"])
 
 
-def initialise(weights: list[torch.Tensor], settings: DictConfig) -> None:
+def initialise(weights: list[torch.Tensor], settings: RLPDSettings) -> None:
     """Draws stacks of weights, first layer to last; the last hidden one has a gain of its own."""
-    fill = INITIALISERS.get(settings.init)
-    if fill is None:
-        raise ValueError(f"rlpd.init={settings.init}: expected one of {list(INITIALISERS)}.")
+    fill = INITIALISERS[settings.init]
     for layer, weight in enumerate(weights):
-        gain = settings.last_hidden_gain if layer == len(weights) - 2 else 1.0
+        gain = settings.last_hidden_gain if layer == len(weights) - 2 else settings.gain
         for member in weight:
             fill(member, gain=gain)

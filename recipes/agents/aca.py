@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Annotated, Any, Literal
 
 import torch
-from omegaconf import DictConfig
+from pydantic import Field, model_validator
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.objectives import SoftUpdate
@@ -14,39 +15,90 @@ from torchrl_aca import ACALoss, CriticGuidedDenoisingActor, NoiseLevelCritic, N
 from torchrl_aca.training.acceleration import capture, compiled, descend, make_adam
 from torchrl_aca.training.agent import Agent
 from torchrl_aca.training.checkpoint import Counters
+from torchrl_aca.training.config import (
+    Count,
+    NonNegative,
+    Optim,
+    Positive,
+    Section,
+    Widths,
+)
 
 SCHEDULES = {
     "cosine": NoiseSchedule.cosine,
     "linear": NoiseSchedule.linear,
     "vp": NoiseSchedule.vp,
 }
+Candidates = Annotated[int, Field(ge=1, le=10**5)]
 
 
-def make_aca_loss(cfg: DictConfig, env: EnvBase, device: torch.device) -> ACALoss:
+class ACASettings(Section):
+    """The section `aca`."""
+
+    num_steps: Annotated[int, Field(ge=1, le=1000)]
+    num_inference_steps: Annotated[int, Field(ge=1, le=1000)]
+    schedule: Literal["cosine", "linear", "vp"]
+    num_cells: Widths
+    num_critics: Annotated[int, Field(ge=1, le=1000)]
+    first_level: Annotated[int, Field(ge=0, le=1)]
+    guidance_weight: NonNegative
+    num_candidates: Candidates
+    num_target_candidates: Candidates
+    exploration_noise: Annotated[float, Field(ge=0, le=1e3)]  # of actions in [-1, 1]
+    alpha_init: Positive
+    noise_level_target: Literal["mean", "self"]
+    noise_level_interval: Count
+    alpha_interval: Count
+    target_entropy_scale: float
+    reward_scale: Positive
+
+    @model_validator(mode="after")
+    def _levels(self) -> ACASettings:
+        if self.num_inference_steps > self.num_steps:
+            self.refuse("num_inference_steps", f"at most aca.num_steps ({self.num_steps})")
+        return self
+
+
+class ACAOptim(Optim):
+    """The section `optim` of ACA."""
+
+    lr: Positive
+    lr_end: NonNegative
+    lr_decay_start: NonNegative
+    lr_decay_end: NonNegative
+    alpha_lr: Positive
+
+    @model_validator(mode="after")
+    def _decay(self) -> ACAOptim:
+        if self.lr_decay_end < self.lr_decay_start:
+            expected = f"at least optim.lr_decay_start ({self.lr_decay_start})"
+            self.refuse("lr_decay_end", expected)
+        return self
+
+
+def make_aca_loss(cfg: Any, env: EnvBase, device: torch.device) -> ACALoss:
     """The critic, the actor that it guides, and their loss."""
     settings = cfg.aca
-    schedule = SCHEDULES.get(settings.schedule)
-    if schedule is None:
-        raise ValueError(f"aca.schedule={settings.schedule}: expected one of {list(SCHEDULES)}.")
     action_spec = env.action_spec_unbatched
     critic = NoiseLevelCritic(
         env.observation_spec["observation"].shape[-1],
         action_spec.shape[-1],
         num_steps=settings.num_steps,
         num_critics=settings.num_critics,
-        num_cells=list(settings.num_cells),
+        num_cells=settings.num_cells,
         first_level=settings.first_level,
         device=device,
     )
     actor = CriticGuidedDenoisingActor(
         critic,
-        schedule(settings.num_steps),
+        SCHEDULES[settings.schedule](settings.num_steps),
         spec=action_spec,
         guidance_weight=settings.guidance_weight,
         num_candidates=settings.num_candidates,
         num_inference_steps=settings.num_inference_steps,
         exploration_noise=settings.exploration_noise,
         alpha_init=settings.alpha_init,
+        deterministic_draws=cfg.eval.draws,
         compile_step=cfg.compile,
     ).to(device)
     loss = ACALoss(
@@ -60,7 +112,7 @@ def make_aca_loss(cfg: DictConfig, env: EnvBase, device: torch.device) -> ACALos
     return loss
 
 
-def make_aca(cfg: DictConfig, env: EnvBase, device: torch.device) -> Agent:
+def make_aca(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
     """ACA, in the official code's order: a TD step, then at even updates a noise-level step.
 
     The four steps are functions of a batch alone, so that each can be captured as a CUDA graph;
@@ -69,30 +121,30 @@ def make_aca(cfg: DictConfig, env: EnvBase, device: torch.device) -> Agent:
     settings, optim = cfg.aca, cfg.optim
     loss = make_aca_loss(cfg, env, device)
     target_update = SoftUpdate(loss, tau=optim.tau)
-    optimizer = make_adam(loss.qvalue_network.parameters(), optim.lr, cfg)
-    alpha_optimizer = make_adam([loss.log_alpha], optim.alpha_lr, cfg)
+    optimizer = make_adam(loss.qvalue_network.parameters(), optim.lr, cfg.cudagraphs)
+    alpha_optimizer = make_adam([loss.log_alpha], optim.alpha_lr, cfg.cudagraphs)
     # The decay counts steps of the optimiser, of which an update takes one or two.
     scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, partial(lr_factor, optim))
     progress = Counters()
     # The chain compiles its own step, so it is drawn before the compiled loss.
-    qvalue_loss = compiled(loss.qvalue_loss, cfg)
-    noise_level_loss = compiled(loss.noise_level_loss, cfg)
+    qvalue_loss = compiled(loss.qvalue_loss, cfg.compile)
+    noise_level_loss = compiled(loss.noise_level_loss, cfg.compile)
 
-    @partial(capture, cfg=cfg)
+    @partial(capture, enabled=cfg.cudagraphs)
     def td_step(batch: TensorDictBase) -> TensorDictBase:
         batch = batch.copy()
         batch[loss.tensor_keys.next_action] = loss.sample_next_action(batch)
         return descend(qvalue_loss(batch), "loss_qvalue", optimizer)
 
-    @partial(capture, cfg=cfg)
+    @partial(capture, enabled=cfg.cudagraphs)
     def noise_level_step(batch: TensorDictBase) -> TensorDictBase:
         return descend(noise_level_loss(batch), "loss_noise_level", optimizer)
 
-    @partial(capture, cfg=cfg)
+    @partial(capture, enabled=cfg.cudagraphs)
     def alpha_step(batch: TensorDictBase) -> TensorDictBase:
         return descend(loss.alpha_loss(), "loss_alpha", alpha_optimizer)
 
-    @partial(capture, cfg=cfg)
+    @partial(capture, enabled=cfg.cudagraphs)
     def target_step(batch: TensorDictBase) -> None:
         target_update.step()
 
@@ -121,7 +173,7 @@ def make_aca(cfg: DictConfig, env: EnvBase, device: torch.device) -> Agent:
     )
 
 
-def lr_factor(optim: DictConfig, step: int) -> float:
+def lr_factor(optim: ACAOptim, step: int) -> float:
     """Returns the factor of `lr` after so many optimiser steps: linear decay to `lr_end`."""
     span = max(optim.lr_decay_end - optim.lr_decay_start, 1)
     progress = min(max((step - optim.lr_decay_start) / span, 0.0), 1.0)

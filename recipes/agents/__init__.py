@@ -1,0 +1,94 @@
+"""The algorithms that the recipes can train, by name, and what their configurations hold."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from pydantic import create_model
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
+
+from agents.aca import ACAOptim, ACASettings, make_aca
+from agents.rlpd import RLPDOptim, RLPDSettings, Variant, make_rlpd
+from agents.sac import SACOptim, SACSettings, make_sac
+from torchrl_aca.errors import RunError
+from torchrl_aca.training.agent import Agent
+from torchrl_aca.training.checkpoint import read_checkpoint, restore
+from torchrl_aca.training.config import RunConfig, Section, checked
+from torchrl_aca.training.envs import make_vector_env
+
+
+@dataclass(frozen=True)
+class Method:
+    """An algorithm.
+
+    Attributes:
+        make: Builds the agent from a typed configuration, an environment and a device.
+        sections: The sections of a configuration that are the method's own, by name.
+    """
+
+    make: Callable[[Any, EnvBase, torch.device], Agent]
+    sections: Mapping[str, type[Section]]
+
+
+AGENTS = {
+    "aca": Method(make_aca, {"aca": ACASettings, "optim": ACAOptim}),
+    "rlpd": Method(make_rlpd, {"rlpd": RLPDSettings, "variant": Variant, "optim": RLPDOptim}),
+    "sac": Method(make_sac, {"sac": SACSettings, "optim": SACOptim}),
+}
+
+Recipe = TypeVar("Recipe", bound=RunConfig)
+
+
+def configured(cfg: DictConfig, recipe: type[Recipe] = RunConfig) -> Recipe:
+    """Returns a composed configuration, checked against the recipe's schema and the method's.
+
+    Raises:
+        RunError: Naming each wrong key, what was expected and what was got.
+    """
+    name = OmegaConf.select(cfg, "algo.name")
+    if name not in AGENTS:
+        known = sorted(AGENTS)
+        raise RunError(f"algo.name={name!r}: expected one of {known}. Set it with algo=... .")
+    sections = AGENTS[name].sections
+    if missing := sections.keys() - cfg.keys():
+        raise RunError(
+            f"algo.name={name}: the configuration has no section {sorted(missing)[0]!r}. Choose "
+            f"the method with algo={name}, which brings its settings along."
+        )
+    # A task's file may hold settings of a method that is not the one that is trained.
+    others = {key for method in AGENTS.values() for key in method.sections} - sections.keys()
+    kept = OmegaConf.masked_copy(cfg, [key for key in cfg if key not in others])
+    fields: dict[str, Any] = {key: (schema, ...) for key, schema in sections.items()}
+    return checked(create_model(recipe.__name__, __base__=recipe, **fields), kept)
+
+
+def make_agent(cfg: RunConfig, env: EnvBase, device: torch.device) -> Agent:
+    """Builds the agent; a value that one of its parts refuses is told in one message."""
+    try:
+        return AGENTS[cfg.algo.name].make(cfg, env, device)
+    except ValueError as error:
+        raise RunError(f"algo={cfg.algo.name} cannot be built: {error}") from error
+
+
+def load_policy(
+    run_dir: str | Path, device: str | torch.device = "cpu"
+) -> tuple[TensorDictModuleBase, RunConfig]:
+    """Returns the policy that a run ended with, and the run's configuration.
+
+    Raises:
+        RunError: If there is no run, or its newest checkpoint cannot be used.
+    """
+    checkpoint = read_checkpoint(Path(run_dir))
+    stored = OmegaConf.create(checkpoint["config"])
+    recipe_keys = {*RunConfig.model_fields, *AGENTS[stored.algo.name].sections}
+    cfg = configured(OmegaConf.masked_copy(stored, [k for k in stored if k in recipe_keys]))
+    env = make_vector_env(cfg.env.name, 1, 0)
+    agent = make_agent(cfg, env, torch.device(device))
+    restore({"agent.loss": agent.state["loss"]}, checkpoint["parts"])
+    return agent.policy, cfg

@@ -1,0 +1,17 @@
+"""Replay: what a row is, the buffer and its state, exact mixtures. Knows no algorithm."""
+
+from torchrl_aca.replay.buffer import (
+    TRANSITION_KEYS,
+    BufferState,
+    make_replay_buffer,
+    transitions,
+)
+from torchrl_aca.replay.mixture import MixedReplayBuffer
+
+__all__ = [
+    "TRANSITION_KEYS",
+    "BufferState",
+    "MixedReplayBuffer",
+    "make_replay_buffer",
+    "transitions",
+]

@@ -1,0 +1,67 @@
+"""Transitions, the replay buffer that keeps them, and its state."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
+from torchrl.data import LazyTensorStorage, ReplayBuffer, TensorDictReplayBuffer
+
+__all__ = ["TRANSITION_KEYS", "BufferState", "make_replay_buffer", "transitions"]
+
+TRANSITION_KEYS: tuple[NestedKey, ...] = (
+    "observation",
+    "action",
+    ("next", "observation"),
+    ("next", "reward"),
+    ("next", "done"),
+    ("next", "terminated"),
+)
+
+
+def make_replay_buffer(capacity: int, batch_size: int) -> TensorDictReplayBuffer:
+    """Builds a uniform replay buffer in main memory, allocated at the first `extend`."""
+    return TensorDictReplayBuffer(storage=LazyTensorStorage(capacity), batch_size=batch_size)
+
+
+def transitions(data: TensorDictBase, extra_keys: Sequence[NestedKey] = ()) -> TensorDictBase:
+    """Flattens collected data of shape (num_envs, steps) and keeps what learning needs.
+
+    Args:
+        data: What a collector gives.
+        extra_keys: What a method needs in a row besides the transition.
+    """
+    return data.select(*TRANSITION_KEYS, *extra_keys).reshape(-1)
+
+
+class BufferState:
+    """The filled part of a replay buffer, for checkpoints."""
+
+    def __init__(self, buffer: ReplayBuffer, keys: Sequence[NestedKey] = TRANSITION_KEYS) -> None:
+        """Takes the buffer, which is only read when a state is asked for, and the keys to keep."""
+        self.buffer, self.keys = buffer, keys
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns the rows in storage order and the writer's position."""
+        return {"rows": self._rows(), "writer": self.buffer.writer.state_dict()}
+
+    def _rows(self) -> dict[str, torch.Tensor]:
+        size = len(self.buffer)
+        if size == 0:  # a storage that is allocated lazily cannot be read yet
+            return {}
+        rows = self.buffer[:size].select(*self.keys, strict=False).flatten_keys(".")
+        if size < self.buffer.storage.max_size:
+            # A view would be written with the whole, mostly empty storage behind it.
+            rows = rows.clone()
+        return rows.to_dict()
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Replaces the buffer's content."""
+        self.buffer.empty()
+        if state_dict["rows"]:
+            rows = TensorDict(state_dict["rows"]).auto_batch_size_(1).unflatten_keys(".")
+            self.buffer.extend(rows)
+        self.buffer.writer.load_state_dict(state_dict["writer"])

@@ -1,0 +1,99 @@
+"""The configuration of a run that goes on: its own, with the few keys that may change."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from torchrl_aca.errors import RunError
+from torchrl_aca.training.checkpoint import read_checkpoint
+
+MAY_CHANGE_ON_RESUME = (
+    "optim.total_updates",
+    "num_threads",
+    "logger",
+    "checkpoint",
+    "video",
+    "eval.stop_return",
+)
+NOT_COMPARED = (*MAY_CHANGE_ON_RESUME, "resume", "run_dir")
+
+
+def resumed_config(cfg: DictConfig, overrides: Iterable[str]) -> tuple[DictConfig, dict[str, Any]]:
+    """Returns the configuration of the run in `cfg.resume` and its newest checkpoint.
+
+    The checkpoint knows how its networks were built, so the configuration is read from there;
+    config.yaml is compared with it where it can be read, because it may have been edited since.
+
+    Args:
+        cfg: The configuration that was composed for this call.
+        overrides: What the user typed, such as "optim.total_updates=2000".
+
+    Raises:
+        RunError: If there is no run, or an override would change what the run is.
+    """
+    run_dir = Path(cfg.resume)
+    checkpoint = read_checkpoint(run_dir)
+    run = OmegaConf.create(checkpoint["config"])
+    stored = read_config(run_dir)
+    if stored is not None:
+        require_equal(stored, run, stored, f"{run_dir / 'config.yaml'}")
+        for key in MAY_CHANGE_ON_RESUME:
+            OmegaConf.update(run, key, OmegaConf.select(stored, key))
+    apply_overrides(run, cfg, overrides)
+    run.resume = str(run_dir)
+    return run, checkpoint
+
+
+def read_config(run_dir: Path) -> DictConfig | None:
+    """Returns a run directory's config.yaml, or None where it is missing, empty or damaged."""
+    try:
+        stored = OmegaConf.load(run_dir / "config.yaml")
+    except Exception:  # what a YAML parser raises depends on the foreign bytes
+        return None
+    return stored if isinstance(stored, DictConfig) and stored else None
+
+
+def apply_overrides(run: DictConfig, cfg: DictConfig, overrides: Iterable[str]) -> None:
+    """Brings what the user typed into a run's configuration.
+
+    Args:
+        run: The run's configuration; changed in place.
+        cfg: The configuration that was composed with the overrides.
+        overrides: What the user typed, such as "optim.total_updates=2000".
+
+    Raises:
+        RunError: If an override would change what the run is.
+    """
+    typed = {override.split("=")[0].lstrip("+~") for override in overrides} - {"resume"}
+    for key in sorted(typed):
+        part = OmegaConf.create({})
+        OmegaConf.update(part, key, OmegaConf.select(cfg, key))
+        require_equal(part, run, part, "the command line")
+        OmegaConf.update(run, key, OmegaConf.select(cfg, key))
+
+
+def require_equal(
+    new: DictConfig, run: DictConfig, keys: DictConfig, where: str, prefix: str = ""
+) -> None:
+    """Compares the entries of `keys` in two configurations, but for those that may change.
+
+    Raises:
+        RunError: Naming the first key that `run` has otherwise than `new`, which is from `where`.
+    """
+    for name in keys:
+        key = f"{prefix}{name}"
+        if any(key == free or key.startswith(f"{free}.") for free in NOT_COMPARED):
+            continue
+        value = OmegaConf.select(new, key)
+        if isinstance(value, DictConfig):
+            require_equal(new, run, value, where, f"{key}.")
+        elif value != OmegaConf.select(run, key):
+            raise RunError(
+                f"{where} has {key}={value}, but the run to resume has "
+                f"{key}={OmegaConf.select(run, key)}. Only {', '.join(MAY_CHANGE_ON_RESUME)} may "
+                f"change: leave {key} out, or start a new run without resume=."
+            )
