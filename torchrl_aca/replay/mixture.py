@@ -93,8 +93,6 @@ class MixedReplayBuffer:
         keys: Sequence[NestedKey] | None = None,
         seed: int = 0,
     ) -> None:
-        if not 0 <= offline_fraction <= 1:
-            raise ValueError(f"Expected offline_fraction in [0, 1], got {offline_fraction}.")
         check_at_least(1, batch_size=batch_size)
         if offline is None and (offline_fraction or keys is None):
             raise ValueError(
@@ -103,7 +101,7 @@ class MixedReplayBuffer:
             )
         require_plain(online, "online")
         self.online, self.batch_size = online, batch_size
-        self._fraction = Fraction(str(offline_fraction))
+        self.offline_fraction = offline_fraction
         self._generator = torch.Generator().manual_seed(seed)
         self._offline = rows_of(offline)
         if keys is None:
@@ -119,6 +117,21 @@ class MixedReplayBuffer:
     def __len__(self) -> int:
         """The rows of both halves."""
         return len(self._offline) + len(self.online)
+
+    @property
+    def offline_fraction(self) -> float:
+        """Share of the offline rows in a batch; it may change between two batches.
+
+        Raises:
+            ValueError: if it is set to a number outside [0, 1].
+        """
+        return float(self._fraction)
+
+    @offline_fraction.setter
+    def offline_fraction(self, value: float) -> None:
+        if not 0 <= value <= 1:
+            raise ValueError(f"Expected offline_fraction in [0, 1], got {value}.")
+        self._fraction = Fraction(str(value))
 
     def num_offline(self, batch_size: int) -> int:
         """Number of offline rows in a batch of ``batch_size``; they are its first rows."""
@@ -204,6 +217,7 @@ class MixedReplayBuffer:
         return {
             "generator": self._generator.get_state(),
             "built_from": self._built_from(),
+            "offline_fraction": self.offline_fraction,
             "online": BufferState(self.online, self.keys).state_dict(),
         }
 
@@ -211,7 +225,7 @@ class MixedReplayBuffer:
         """Restore what :meth:`state_dict` returned; the next batches are those that were due.
 
         Raises:
-            ValueError: if shares, batch size, offline data, keys or capacity are not the state's.
+            ValueError: if batch size, offline data, keys or capacity are not the state's.
         """
         for name, got in self._built_from().items():
             if (expected := state_dict["built_from"][name]) != got:
@@ -219,13 +233,13 @@ class MixedReplayBuffer:
                     f"The state belongs to another mixture: expected {name} {expected}, got {got}. "
                     "Build the mixture as it was when the state was saved."
                 )
+        self.offline_fraction = state_dict["offline_fraction"]
         BufferState(self.online, self.keys).load_state_dict(state_dict["online"])
         self._generator.set_state(state_dict["generator"])
 
     def _built_from(self) -> dict[str, Any]:
         """What a state does not hold, but is good for alone."""
         return {
-            "offline_fraction": str(self._fraction),
             "batch_size": self.batch_size,
             "online capacity": self.online.storage.max_size,
             "keys": self.keys,

@@ -114,7 +114,7 @@ class Collection:
         if state_dict["env"] is None:
             self.episodes.reset()
         else:
-            EnvState(self.env).load_state_dict(state_dict["env"])
+            EnvState(self.env).load_state_dict(state_dict["env"], in_episode=self.frames > 0)
 
 
 class EpisodeTracker:

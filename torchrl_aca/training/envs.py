@@ -74,8 +74,13 @@ class ResumableEnv(gym.Wrapper):
             state["simulation"] = _simulation_state(self.unwrapped.model, self.unwrapped.data)
         return state
 
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restores what `state_dict` returned into an environment of the same kind."""
+    def load_state_dict(self, state_dict: dict[str, Any], *, in_episode: bool = True) -> None:
+        """Restores what `state_dict` returned into an environment of the same kind.
+
+        Args:
+            state_dict: The state.
+            in_episode: Whether the next `reset` goes on with the state's episode.
+        """
         self._resumed = False
         self.reset()  # satisfies the wrappers that forbid a step before a reset
         self.unwrapped.np_random.bit_generator.state = state_dict["random"]
@@ -86,7 +91,7 @@ class ResumableEnv(gym.Wrapper):
             self.time_limit._elapsed_steps = state_dict["elapsed_steps"]
         self._observation = state_dict["observation"].numpy()
         _load_simulation_state(self.unwrapped.model, self.unwrapped.data, state_dict["simulation"])
-        self._resumed = True
+        self._resumed = in_episode
 
     @property
     def time_limit(self) -> TimeLimit | None:
@@ -139,10 +144,16 @@ class EnvState:
         """Returns the state of each."""
         return {"copies": [copy.state_dict() for copy in self.copies]}
 
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restores them; build the collector after this, not before."""
+    def load_state_dict(self, state_dict: dict[str, Any], *, in_episode: bool = True) -> None:
+        """Restores them; build the collector after this, not before.
+
+        Args:
+            state_dict: What `state_dict` returned.
+            in_episode: Whether the next `reset` goes on with the episode of the state. If nothing
+                had been collected yet, it starts the one that was due.
+        """
         for copy, state in zip(self.copies, state_dict["copies"], strict=True):
-            copy.load_state_dict(state)
+            copy.load_state_dict(state, in_episode=in_episode)
 
 
 def make_env(name: str, **kwargs: Any) -> gym.Env:
