@@ -24,31 +24,30 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-import bandit_tables as tables
 import hydra
 import torch
-from bandit_figures import draw_figures
-from bandit_tables import METHODS, Row
 from omegaconf import DictConfig, OmegaConf
 from torchrl import logger as torchrl_logger
 from torchrl.collectors import Collector
 from torchrl.modules import MLP, ValueOperator
 from torchrl_aca.training.data import make_replay_buffer, transitions
 from tqdm import tqdm
-from two_d_bandit import TwoDBandit, mode_shares, reward
 
+from bandit import tables
+from bandit.env import TwoDBandit, mode_shares, reward
+from bandit.figures import draw_figures
+from bandit.tables import METHODS, Row
 from torchrl_aca import ACALoss, CriticGuidedDenoisingActor, NoiseLevelCritic, NoiseSchedule
 from torchrl_aca.errors import RunError
 from torchrl_aca.training.randomness import seed_everything
 from torchrl_aca.training.report import versions
 
-SCHEDULES = ("linear", "cosine", "vp")
-Task = tuple[DictConfig, str, int]  # settings, method, training seed
+Task = tuple[BanditConfig, str, int]  # settings, method, training seed
 
 
-def make_actor(cfg: DictConfig, method: str) -> CriticGuidedDenoisingActor:
+def make_actor(cfg: BanditConfig, method: str) -> CriticGuidedDenoisingActor:
     """The method's sampler on a fresh critic of its own."""
-    chain, num_cells = cfg.chain, list(cfg.critic.num_cells)
+    chain, num_cells = cfg.chain, cfg.critic.num_cells
     if method == "aca":
         critic = NoiseLevelCritic(
             1, 2, num_steps=chain.num_steps, num_critics=cfg.critic.num_critics, num_cells=num_cells
@@ -58,7 +57,7 @@ def make_actor(cfg: DictConfig, method: str) -> CriticGuidedDenoisingActor:
             MLP(3, cfg.critic.num_critics, num_cells=num_cells, activation_class=torch.nn.Mish),
             in_keys=["observation", "action"],
         )
-    settings = chain.get(chain.schedule, {})
+    settings = chain.linear.model_dump() if chain.schedule == "linear" else {}
     return CriticGuidedDenoisingActor(
         critic,
         getattr(NoiseSchedule, chain.schedule)(chain.num_steps, **settings),
@@ -73,7 +72,7 @@ def make_actor(cfg: DictConfig, method: str) -> CriticGuidedDenoisingActor:
     )
 
 
-def train(cfg: DictConfig, method: str, seed: int) -> CriticGuidedDenoisingActor:
+def train(cfg: BanditConfig, method: str, seed: int) -> CriticGuidedDenoisingActor:
     """Trains the method's critic on random actions, or on those that the method draws itself."""
     seed_everything(seed)
     actor, collection = make_actor(cfg, method), cfg.collector
@@ -82,13 +81,14 @@ def train(cfg: DictConfig, method: str, seed: int) -> CriticGuidedDenoisingActor
     optimizer = torch.optim.Adam(actor.critic.parameters(), lr=cfg.optim.lr)
     num_updates = collection.frames // collection.frames_per_batch * cfg.optim.updates_per_batch
     scheduler = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, num_updates)
+    uniform = cfg.data == "uniform"
     buffer = make_replay_buffer(collection.frames, cfg.optim.batch_size)
     collector = Collector(
         TwoDBandit(collection.frames_per_batch, collection.half_width),
         actor,
         frames_per_batch=collection.frames_per_batch,
         total_frames=collection.frames,
-        init_random_frames=collection["frames" if cfg.data == "uniform" else "init_random_frames"],
+        init_random_frames=collection.frames if uniform else collection.init_random_frames,
         auto_register_policy_transforms=False,
     )
     for data in collector:
@@ -119,7 +119,7 @@ def measure(actions: torch.Tensor) -> Row:
     return {**shares, "sum": sum(shares.values()), **moments}
 
 
-def sweep(cfg: DictConfig, actor: CriticGuidedDenoisingActor) -> list[Row]:
+def sweep(cfg: BanditConfig, actor: CriticGuidedDenoisingActor) -> list[Row]:
     """Measures every guidance weight, and leaves the actor with the most rewarding one."""
     rows = []
     for weight in cfg.sweep.weights:
@@ -129,11 +129,6 @@ def sweep(cfg: DictConfig, actor: CriticGuidedDenoisingActor) -> list[Row]:
     return rows
 
 
-def combinations(options: Mapping[str, Sequence[Any]]) -> list[Row]:
-    """Every way to choose one value for each key; the empty choice where there are no keys."""
-    return [dict(zip(options, values, strict=True)) for values in product(*options.values())]
-
-
 def run(task: Task) -> tuple[list[Row], list[Row], bytes]:
     """Reported rows, the sweeps' rows, and the actor: as bytes, to leave a worker process."""
     cfg, method, seed = task
@@ -141,7 +136,7 @@ def run(task: Task) -> tuple[list[Row], list[Row], bytes]:
     torchrl_logger.setLevel("WARNING")  # its notes about storages would break the progress bar
     actor = train(cfg, method, seed)
     reported, swept = [], []
-    for changed in combinations(cfg.ablation.sampling):
+    for changed in cfg.ablation.samplings():
         for name, value in changed.items():
             setattr(actor, name, value)
         label = {"method": method, "seed": seed, **changed}
@@ -163,7 +158,7 @@ def run_all(
             yield from bar(pool.imap(run, tasks))
 
 
-def study(cfg: DictConfig, run_dir: Path) -> None:
+def study(cfg: BanditConfig, run_dir: Path) -> None:
     """Runs all methods and seeds; writes the tables and, where asked for, the figures."""
     tasks = [(cfg, method, seed) for method in cfg.methods for seed in cfg.seeds]
     reported, swept, actors = [], [], {}
@@ -181,62 +176,31 @@ def study(cfg: DictConfig, run_dir: Path) -> None:
         draw_figures(run_dir, actors, reported, swept)
 
 
-def ablate(cfg: DictConfig, run_dir: Path) -> None:
+def ablate(cfg: BanditConfig, run_dir: Path) -> None:
     """One row for each combination of the ablation's values, each method and each seed."""
-    tasks, settings = [], []
-    for changed in combinations(cfg.ablation.training):
-        variant = cfg.copy()
-        for key, value in changed.items():
-            OmegaConf.update(variant, key, value)
-        for method, seed in product(cfg.methods, cfg.seeds):
-            tasks.append((variant, method, seed))
-            settings.append(changed)
+    pairs = list(product(cfg.methods, cfg.seeds))
+    tasks = [(variant, *pair) for _, variant in variants(cfg) for pair in pairs]
+    settings = [changed for changed, _ in variants(cfg) for _ in pairs]
     table = []
     for changed, (rows, *_) in zip(settings, run_all(tasks, cfg.num_workers), strict=True):
         table += [{**changed, **row} for row in rows]
     tables.write_csv(run_dir / "ablation.csv", table)
-    compact = tables.side_by_side(table, [*cfg.ablation.training, *cfg.ablation.sampling])
+    compact = tables.side_by_side(table, [*cfg.ablation.training, *cfg.ablation.samplings()[0]])
     tables.write_csv(run_dir / "ablation_table.csv", compact)
     print(tables.as_text(compact))
 
 
-def validate(cfg: DictConfig) -> None:
-    """Checks what would otherwise fail late or pass unseen.
-
-    Raises:
-        RunError: naming the key, what was expected and what was got.
-    """
-    frames, size, weights = cfg.collector.frames, cfg.collector.frames_per_batch, cfg.sweep.weights
-    sizes = ("collector.frames_per_batch", "optim.batch_size", "num_workers", "num_threads")
-    checks: dict[str, tuple[Any, str]] = {
-        **{key: (OmegaConf.select(cfg, key) >= 1, "at least 1") for key in sizes},
-        "data": (cfg.data in ("uniform", "online"), "uniform or online"),
-        "chain.schedule": (cfg.chain.schedule in SCHEDULES, f"one of {SCHEDULES}"),
-        "methods": (cfg.methods and set(cfg.methods) <= set(METHODS), f"some of {list(METHODS)}"),
-        "seeds": (cfg.seeds, "at least one seed"),
-        "sweep.weights": (weights and min(weights) >= 0, "weights of at least 0"),
-        "collector.frames": (
-            frames > 0 and frames % max(size, 1) == 0,
-            f"a multiple of frames_per_batch, {size}",
-        ),
-    }
-    for key, (fits, what) in checks.items():
-        if not fits:
-            raise RunError(f"{key}={OmegaConf.select(cfg, key)}: expected {what}. Set {key}=... .")
-
-
 @hydra.main(version_base="1.3", config_path="configs", config_name="bandit_2d")
-def main(cfg: DictConfig) -> None:
-    """Runs the study or its ablation into a new directory."""
-    run_dir = Path(cfg.run_dir or Path("runs") / f"bandit_2d-{time.strftime('%Y%m%d-%H%M%S')}")
+def main(composed: DictConfig) -> None:
+    """Runs the study or its ablation into a new directory; an error is told in one message."""
     try:
-        validate(cfg)
-        if (run_dir / "config.yaml").exists():
-            raise RunError(f"run_dir={run_dir} already holds a run; expected a new directory.")
+        cfg = checked(BanditConfig, composed)
+        variants(cfg)  # for their mistakes
+        run_dir = make_run_dir(cfg.run_dir, "bandit_2d")
+        started = lock(run_dir)
+        write_text(run_dir / "config.yaml", OmegaConf.to_yaml(composed))
     except RunError as error:
         raise SystemExit(f"error: {error}") from None
-    run_dir.mkdir(parents=True, exist_ok=True)
-    (run_dir / "config.yaml").write_text(OmegaConf.to_yaml(cfg))
     start, info = time.perf_counter(), versions()
     (ablate if cfg.ablation.training else study)(cfg, run_dir)
     minutes = round((time.perf_counter() - start) / 60, 1)

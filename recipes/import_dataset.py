@@ -8,57 +8,54 @@ Every key is in `configs/import_dataset.yaml`.
 
 from __future__ import annotations
 
-import hydra
-from omegaconf import DictConfig, OmegaConf
+from typing import Any, Literal
 
-from torchrl_aca.offline import DatasetError, OfflineDataset, import_d4rl, import_minari
+import hydra
+from omegaconf import DictConfig
+
+from data.describe import summary
+from torchrl_aca.errors import DatasetError, RunError
+from torchrl_aca.offline import OfflineDataset, import_d4rl, import_minari
+from torchrl_aca.training.config import Section, checked
 
 IMPORTERS = {"d4rl": import_d4rl, "minari": import_minari}
+
+
+class ImporterConfig(Section):
+    """`import_dataset.yaml`; what has `Any` is checked by the importer."""
+
+    source: str | int  # a number is a name
+    format: Literal["d4rl", "minari"]
+    path: str | int
+    name: str | None
+    env_id: str | None
+    reference_scores: Any
+    action_bounds: Any
+    allow_constant: list[Literal["observation", "action", "reward"]]
+    check_continuity: bool
 
 
 def import_dataset(cfg: DictConfig) -> OfflineDataset:
     """Imports what the configuration names.
 
     Raises:
-        DatasetError: If a key is missing or the import fails.
+        DatasetError: If the import fails.
+        RunError: If a key is missing or wrong.
     """
-    needed = ("format", "path", "source")
-    missing = [key for key in needed if OmegaConf.is_missing(cfg, key) or cfg[key] is None]
-    if missing:
-        raise DatasetError(f"expected values for {missing}: set them with {missing[0]}=... .")
-    if cfg.format not in IMPORTERS:
-        raise DatasetError(f"format={cfg.format}: expected one of {list(IMPORTERS)}.")
-    keywords = OmegaConf.to_container(cfg)
-    keywords.update({key: str(keywords[key]) for key in ("source", "path")})  # a number is a name
+    keywords = checked(ImporterConfig, cfg).model_dump()
+    keywords.update({key: str(keywords[key]) for key in ("source", "path")})
     importer = IMPORTERS[keywords.pop("format")]
     if keywords["action_bounds"] is None:
         del keywords["action_bounds"]
     return importer(**keywords)
 
 
-def summary(dataset: OfflineDataset) -> str:
-    """What a user wants to see of a new data set."""
-    metadata = dataset.metadata
-    text = (
-        f"{dataset.path}: {metadata['transitions']} transitions in {metadata['episodes']} episodes"
-    )
-    if returns := metadata["returns"]:
-        text += (
-            f"\nreturns: mean {returns['mean']:.1f}, std {returns['std']:.1f}, "
-            f"range {returns['min']:.1f} to {returns['max']:.1f}"
-        )
-        if metadata["reference_scores"]:
-            text += (
-                f"\nnormalised score of the mean: {dataset.normalized_score(returns['mean']):.1f}"
-            )
-    return text
-
-
 @hydra.main(version_base="1.3", config_path="configs", config_name="import_dataset")
 def main(cfg: DictConfig) -> None:
+    """Imports a data set and says what it holds; an error is told in one message."""
     try:
         print(summary(import_dataset(cfg)))
-    except DatasetError as error:
+    except (DatasetError, RunError) as error:
         raise SystemExit(f"error: {error}") from None
     except KeyboardInterrupt:
         raise SystemExit("stopped: nothing was imported. The same command begins anew.") from None

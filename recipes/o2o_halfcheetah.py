@@ -17,6 +17,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import hydra
+from omegaconf import DictConfig
+from pydantic import Field, model_validator
+
 from agents import configured, make_agent
 from data.offline import (
     generate_missing,
@@ -25,13 +28,10 @@ from data.offline import (
     offline_facts,
     task_scores,
 )
-from omegaconf import DictConfig
-from pydantic import Field, model_validator
-
 from torchrl_aca.offline.scores import normalized_score
 from torchrl_aca.replay import transitions
 from torchrl_aca.training.collection import Collection
-from torchrl_aca.training.config import Count, RunConfig, Share
+from torchrl_aca.training.config import Count, RunConfig, Share, is_number
 from torchrl_aca.training.envs import make_vector_env
 from torchrl_aca.training.evaluation import evaluate, make_eval_env, report_extras
 from torchrl_aca.training.launch import launch, make_device
@@ -53,9 +53,9 @@ class OfflineToOnlineConfig(RunConfig):
     @classmethod
     def _length(cls, values: dict[str, Any]) -> dict[str, Any]:
         """`optim.total_updates: null` means as many as the online frames call for."""
-        optim, ratio, frames = values["optim"], values.get("utd"), values.get("online_frames")
-        if optim["total_updates"] is None and isinstance(ratio, int | float) and isinstance(frames, int):
-            optim["total_updates"] = int(frames * Fraction(str(ratio)))
+        ratio, frames = values.get("utd"), values.get("online_frames")
+        if values["optim"]["total_updates"] is None and is_number(ratio) and is_number(frames):
+            values["optim"]["total_updates"] = int(frames * Fraction(str(ratio)))
         return values
 
 

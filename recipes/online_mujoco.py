@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any
 
 import hydra
-from agents import configured, make_agent
 from omegaconf import DictConfig
 
+from agents import configured, make_agent
 from torchrl_aca.replay import make_replay_buffer, transitions
 from torchrl_aca.training.collection import Collection
 from torchrl_aca.training.envs import make_vector_env

@@ -84,7 +84,7 @@ def oracle_density(actions):
 
 
 def test_reward_is_the_mixtures_density_scaled_to_one():
-    from two_d_bandit import TwoDBandit
+    from bandit.env import TwoDBandit
 
     actions = np.random.default_rng(0).uniform(-2.5, 2.5, (500, 2))
     line = np.linspace(-1.5, 1.5, 1501)
@@ -96,7 +96,7 @@ def test_reward_is_the_mixtures_density_scaled_to_one():
 
 
 def test_highest_reward_is_one_and_the_low_modes_have_half():
-    from two_d_bandit import reward
+    from bandit.env import reward
 
     line = torch.linspace(-2, 2, 1001)
     assert reward(torch.cartesian_prod(line, line)).max().item() == pytest.approx(1, abs=1e-4)
@@ -105,7 +105,7 @@ def test_highest_reward_is_one_and_the_low_modes_have_half():
 
 @pytest.mark.parametrize("num_envs", [1, 7])
 def test_env_keeps_its_specs_and_ends_after_one_step(num_envs):
-    from two_d_bandit import TwoDBandit
+    from bandit.env import TwoDBandit
 
     env = TwoDBandit(num_envs, half_width=2.5)
     check_env_specs(env)
@@ -116,7 +116,7 @@ def test_env_keeps_its_specs_and_ends_after_one_step(num_envs):
 
 
 def test_shares_count_what_lies_within_the_radius_in_the_papers_order():
-    from two_d_bandit import mode_shares
+    from bandit.env import mode_shares
 
     near = HIGH + np.array([0.29, 0.0])
     far = HIGH + np.array([0.0, 0.31])

@@ -118,9 +118,11 @@ def train(run_dir: Path, *, warmup="random", stop=None, resume=False, changes=No
 
     Returns what happened, in order.
     """
-    cfg = checked(RunConfig, {**SETTINGS, "run_dir": str(run_dir), **(changes or {})} | {
-        "collector": {**SETTINGS["collector"], "warmup": warmup}
-    })
+    cfg = checked(
+        RunConfig,
+        {**SETTINGS, "run_dir": str(run_dir), **(changes or {})}
+        | {"collector": {**SETTINGS["collector"], "warmup": warmup}},
+    )
     checkpoint = read_checkpoint(run_dir) if resume else None
     cfg.resume = str(run_dir) if resume else None
     seed_everything(cfg.seed)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -61,11 +61,18 @@ def configured(cfg: DictConfig, recipe: type[Recipe] = RunConfig) -> Recipe:
             f"algo.name={name}: the configuration has no section {sorted(missing)[0]!r}. Choose "
             f"the method with algo={name}, which brings its settings along."
         )
-    # A task's file may hold settings of a method that is not the one that is trained.
-    others = {key for method in AGENTS.values() for key in method.sections} - sections.keys()
-    kept = OmegaConf.masked_copy(cfg, [key for key in cfg if key not in others])
     fields: dict[str, Any] = {key: (schema, ...) for key, schema in sections.items()}
-    return checked(create_model(recipe.__name__, __base__=recipe, **fields), kept)
+    schema = create_model(recipe.__name__, __base__=recipe, **fields)
+    return checked(schema, without_methods(cfg, sections))
+
+
+def without_methods(cfg: DictConfig, kept: Collection[str] = ()) -> DictConfig:
+    """Returns a configuration without the methods' sections, but for those in `kept`.
+
+    A task's file may hold settings of a method that is not the one that is trained.
+    """
+    others = {key for method in AGENTS.values() for key in method.sections} - set(kept)
+    return OmegaConf.masked_copy(cfg, [key for key in cfg if key not in others])
 
 
 def make_agent(cfg: RunConfig, env: EnvBase, device: torch.device) -> Agent:

@@ -74,9 +74,9 @@ def make_rlpd(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
 
     At every `rlpd.actor_interval`-th update follows a step of actor and temperature, on the states
     of the last `rlpd.num_actor_batches` batches: one in the original, all since the actor's last
-    step in WSRL's version. WSRL's code has the offline rows of a round in half of its critic steps and the online
-    rows in the other half, because of the order in which it joins them; here every critic step
-    takes a batch as the loop has sampled it.
+    step in WSRL's version. WSRL's code has the offline rows of a round in half of its critic steps
+    and the online rows in the other half, because of the order in which it joins them; here every
+    critic step takes a batch as the loop has sampled it.
     """
     settings, optim = cfg.rlpd, cfg.optim
     loss = make_rlpd_loss(cfg, env, device)

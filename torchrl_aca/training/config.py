@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from typing import Annotated, Any, Literal, NoReturn, TypeVar
 
@@ -145,6 +146,11 @@ class RunConfig(Section):
         if self.eval.seed <= last and self.eval.seed + self.eval.episodes > first:
             self.refuse("eval.seed", f"seeds apart from the training's {first} to {last}")
         return self
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value is a finite number; true and false are none."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 Schema = TypeVar("Schema", bound=Section)

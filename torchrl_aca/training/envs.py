@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -177,6 +178,11 @@ def make_env(name: str, **kwargs: Any) -> gym.Env:
         ) from error
     _check_spaces(name, env)
     return env
+
+
+def task_name(env_id: str) -> str:
+    """Returns an id without module and version, as in names of directories: "halfcheetah"."""
+    return re.sub(r"-v\d+$", "", env_id.split(":")[-1]).lower()
 
 
 def make_vector_env(

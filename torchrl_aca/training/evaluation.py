@@ -38,9 +38,7 @@ def make_eval_env(name: str, settings: Eval) -> GymWrapper:
     Raises:
         RunError: If episodes might never end, or see `make_env`.
     """
-    env = make_vector_env(
-        name, settings.episodes, settings.seed, max_steps=settings.max_steps
-    )
+    env = make_vector_env(name, settings.episodes, settings.seed, max_steps=settings.max_steps)
     if env.envs[0].time_limit is None:
         raise RunError(
             f"{name} has no time limit, so an evaluation of it might never end; expected one. Give "

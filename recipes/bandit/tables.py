@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from two_d_bandit import HIGH_MODES
+from bandit.env import HIGH_MODES
 
 METHODS = {"aca": "ACA", "diffusion_q": "Diffusion-Q", "langevin_q": "Langevin-Q"}
 PAPER = {

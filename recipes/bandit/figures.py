@@ -11,8 +11,8 @@ from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
-from two_d_bandit import HIGH_MODES, MODE_STD, reward
 
+from bandit.env import HIGH_MODES, MODE_STD, reward
 from torchrl_aca import CriticGuidedDenoisingActor
 
 Actors = Mapping[str, CriticGuidedDenoisingActor]

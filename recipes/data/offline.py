@@ -2,27 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import hydra
 import torch
-from make_dataset import make_dataset, task_name
-from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
+from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase
-from torchrl_aca.training.data import TRANSITION_KEYS, make_replay_buffer
 
+from agents import without_methods
+from data.generate import GeneratorConfig, make_dataset
 from torchrl_aca.errors import RunError
-from torchrl_aca.offline import MixedReplayBuffer, OfflineDataset, reference_scores
+from torchrl_aca.offline import OfflineDataset, reference_scores
 from torchrl_aca.offline.layout import METADATA_FILE, sha256
 from torchrl_aca.offline.registry import ROOT
 from torchrl_aca.offline.scores import Scores
-from torchrl_aca.training.config import require
+from torchrl_aca.replay import TRANSITION_KEYS, MixedReplayBuffer, make_replay_buffer
+from torchrl_aca.training.config import checked
+from torchrl_aca.training.envs import task_name
 
 
-def dataset_path(cfg: DictConfig) -> Path:
+def dataset_path(cfg: Any) -> Path:
     """The directory of the data set that `cfg.dataset` names.
 
     Raises:
@@ -46,7 +48,7 @@ def dataset_path(cfg: DictConfig) -> Path:
     )
 
 
-def generate_missing(cfg: DictConfig) -> None:
+def generate_missing(cfg: Any) -> None:
     """Makes the data set where there is none and `cfg.generate` says how.
 
     It draws from the global random streams, so a run is seeded afterwards.
@@ -57,8 +59,11 @@ def generate_missing(cfg: DictConfig) -> None:
     """
     if cfg.generate is None or not cfg.offline_fraction or dataset_path(cfg).exists():
         return
-    fits = isinstance(cfg.generate, DictConfig) and not {"path", "env"} & cfg.generate.keys()
-    require(fits, cfg, "generate", "keys of make_dataset.yaml but path and env")
+    if own := {"path", "env"} & cfg.generate.keys():
+        raise RunError(
+            f"generate={cfg.generate}: expected keys of make_dataset.yaml but {sorted(own)}, which "
+            "follow from dataset and env. Leave them out."
+        )
     recipe = hydra.compose("make_dataset", [f"env.name={cfg.env.name}"])
     try:
         recipe.merge_with(cfg.generate)
@@ -67,14 +72,10 @@ def generate_missing(cfg: DictConfig) -> None:
         raise RunError(f"generate: {message}; expected keys of make_dataset.yaml.") from None
     recipe.path = str(dataset_path(cfg))
     print(f"generating {recipe.path}", flush=True)
-    threads = torch.get_num_threads()
-    try:
-        make_dataset(recipe)
-    finally:
-        torch.set_num_threads(threads)  # the SAC run behind some data has its own number
+    make_dataset(checked(GeneratorConfig, without_methods(recipe, GeneratorConfig.model_fields)))
 
 
-def load_offline_data(cfg: DictConfig, env: EnvBase) -> OfflineDataset | None:
+def load_offline_data(cfg: Any, env: EnvBase) -> OfflineDataset | None:
     """The data set, or None where no minibatch has a part of it.
 
     Raises:
@@ -88,7 +89,7 @@ def load_offline_data(cfg: DictConfig, env: EnvBase) -> OfflineDataset | None:
     return dataset
 
 
-def require_fit(cfg: DictConfig, metadata: Mapping[str, Any], env: EnvBase) -> None:
+def require_fit(cfg: Any, metadata: Mapping[str, Any], env: EnvBase) -> None:
     """Raises `RunError` unless task, sizes and actions of a data set are those of `env`."""
     actions = env.action_spec_unbatched
     source, name = metadata["env_id"], f"dataset={cfg.dataset}"
@@ -113,7 +114,7 @@ def require_fit(cfg: DictConfig, metadata: Mapping[str, Any], env: EnvBase) -> N
         )
 
 
-def task_scores(cfg: DictConfig) -> Scores | None:
+def task_scores(cfg: Any) -> Scores | None:
     """The returns that count as 0 and 100: the data set's, or else those known for the task.
 
     A data set may be named without taking rows from it, so that a control has the same scale.
@@ -125,14 +126,16 @@ def task_scores(cfg: DictConfig) -> Scores | None:
     return reference_scores(cfg.env.name)
 
 
-def make_mixture(cfg: DictConfig, dataset: OfflineDataset | None) -> MixedReplayBuffer:
+def make_mixture(
+    cfg: Any, dataset: OfflineDataset | None, extra_keys: Sequence[NestedKey] = ()
+) -> MixedReplayBuffer:
     """The buffer that minibatches are drawn from. The loss scales the rewards of both halves."""
     return MixedReplayBuffer(
         None if dataset is None else dataset.data,
         make_replay_buffer(cfg.buffer.capacity, cfg.optim.batch_size),
         offline_fraction=cfg.offline_fraction,
         batch_size=cfg.optim.batch_size,
-        keys=TRANSITION_KEYS,
+        keys=(*TRANSITION_KEYS, *extra_keys),
         seed=cfg.seed,
     )
 

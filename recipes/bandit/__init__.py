@@ -1,0 +1,1 @@
+"""Helpers of `bandit_2d.py`."""

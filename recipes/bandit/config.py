@@ -1,0 +1,159 @@
+"""The typed form of `bandit_2d.yaml`, and the variants that an ablation asks for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from itertools import product
+from typing import Annotated, Any, Literal
+
+from omegaconf import OmegaConf
+from pydantic import BeforeValidator, Field, model_validator
+from pydantic_core import PydanticCustomError
+
+from bandit.tables import METHODS, Row
+from torchrl_aca.training.config import (
+    Count,
+    NonNegative,
+    Positive,
+    Section,
+    Seed,
+    Widths,
+    checked,
+)
+
+Method = Literal[tuple(METHODS)]
+Processes = Annotated[int, Field(ge=1, le=4096)]
+
+
+def _clip(value: Any) -> Any:
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if value is False or (is_number and 0 < value < math.inf):
+        return value
+    raise PydanticCustomError("clip", "Input should be false, or a number above 0")
+
+
+Clip = Annotated[Any, BeforeValidator(_clip)]
+
+
+class Sampling(Section):
+    """Settings of the trained actor, with the values to combine."""
+
+    clip_denoised: Annotated[list[Clip], Field(min_length=1)] = []
+    normalize_gradient: Annotated[list[bool], Field(min_length=1)] = []
+    langevin_step_size: Annotated[list[Positive], Field(min_length=1)] = []
+
+
+class Ablation(Section):
+    """What to combine; keys of the configuration are changed before the training."""
+
+    training: dict[str, Annotated[list[Any], Field(min_length=1)]]
+    sampling: Sampling
+
+    def samplings(self) -> list[Row]:
+        """Every combination of the actor's settings."""
+        return combinations(self.sampling.model_dump(exclude_unset=True))
+
+
+class Collector(Section):
+    """How the actions are collected that the critic learns from."""
+
+    half_width: Positive
+    frames: Count
+    frames_per_batch: Count
+    init_random_frames: Annotated[int, Field(ge=0)]
+    guidance_weight: dict[Method, NonNegative]
+
+
+class Critic(Section):
+    """The size of the critics."""
+
+    num_critics: Annotated[int, Field(ge=1, le=1000)]
+    num_cells: Widths
+
+
+class Optim(Section):
+    """The regression."""
+
+    updates_per_batch: Count
+    batch_size: Count
+    lr: Positive
+
+
+class LinearBetas(Section):
+    """The betas of the linear schedule."""
+
+    beta_start: Annotated[float, Field(gt=0, lt=1)]
+    beta_end: Annotated[float, Field(gt=0, lt=1)]
+
+
+class Chain(Section):
+    """How samples are drawn."""
+
+    num_steps: Annotated[int, Field(ge=1, le=1000)]
+    schedule: Literal["linear", "cosine", "vp"]
+    linear: LinearBetas
+    clip_denoised: Clip
+    normalize_gradient: bool
+    langevin_step_size: Positive
+
+
+class Sweep(Section):
+    """The guidance weights to choose from."""
+
+    weights: Annotated[list[NonNegative], Field(min_length=1)]
+    num_samples: Count
+
+
+class Report(Section):
+    """The reported numbers."""
+
+    num_samples: Count
+
+
+class BanditConfig(Section):
+    """`bandit_2d.yaml`."""
+
+    methods: Annotated[list[Method], Field(min_length=1)]
+    seeds: Annotated[list[Seed], Field(min_length=1)]
+    num_workers: Processes
+    num_threads: Processes
+    run_dir: str | None
+    figures: bool
+    ablation: Ablation
+    data: Literal["online", "uniform"]
+    collector: Collector
+    critic: Critic
+    optim: Optim
+    chain: Chain
+    sweep: Sweep
+    report: Report
+
+    @model_validator(mode="after")
+    def _frames(self) -> BanditConfig:
+        size = self.collector.frames_per_batch
+        if self.collector.frames % size:
+            self.refuse("collector.frames", f"a multiple of collector.frames_per_batch ({size})")
+        if missing := set(self.methods) - self.collector.guidance_weight.keys():
+            self.refuse("collector.guidance_weight", f"a weight for {sorted(missing)} as well")
+        return self
+
+
+def combinations(options: Mapping[str, Sequence[Any]]) -> list[Row]:
+    """Every way to choose one value for each key; the empty choice where there are no keys."""
+    return [dict(zip(options, values, strict=True)) for values in product(*options.values())]
+
+
+def variants(cfg: BanditConfig) -> list[tuple[Row, BanditConfig]]:
+    """Every combination of `ablation.training`, with the configuration that has it.
+
+    Raises:
+        RunError: If a key is none of the configuration's, or a value does not fit.
+    """
+    made = []
+    for changed in combinations(cfg.ablation.training):
+        variant = OmegaConf.create(cfg.model_dump(exclude_unset=True))
+        for key, value in changed.items():
+            OmegaConf.update(variant, key, value)
+        made.append((changed, checked(BanditConfig, variant)))
+    return made

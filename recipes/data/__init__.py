@@ -1,0 +1,1 @@
+"""Helpers of the recipes that make or read offline data."""
