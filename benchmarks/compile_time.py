@@ -1,4 +1,4 @@
-"""What compiling costs: `python benchmarks/compile_time.py`.
+"""What compiling costs: `PYTHONPATH=recipes python benchmarks/compile_time.py`.
 
 Seconds of the recipe's first actions and updates with `compile=true`, twice, each time in a new
 process: with an empty cache, and with the cache that the first one left.
@@ -13,9 +13,9 @@ import tempfile
 import time
 
 import torch
-from recipe import configure, make_aca
-from test_speed import make_batch
 
+from recipe import configure, make_recipe_agent
+from test_speed import make_batch
 from torchrl_aca.training.envs import make_vector_env
 
 
@@ -23,7 +23,7 @@ def first_calls(cache: str) -> None:
     """Prints the seconds that acting, two updates and an evaluation's acting take at first."""
     cfg = configure("aca.num_target_candidates=4", "compile=true")
     env, eval_env = (make_vector_env(cfg.env.name, copies, seed=0) for copies in (5, 10))
-    agent = make_aca(cfg, env, torch.device("cpu"))
+    agent = make_recipe_agent(cfg, env)
     batch, data, eval_data = make_batch("HalfCheetah"), env.reset(), eval_env.reset()
     start = time.perf_counter()
     with torch.no_grad():

@@ -1,4 +1,7 @@
-"""Peak memory of an update beyond parameters and batch: `python benchmarks/memory.py 32`.
+"""Peak memory of an update beyond parameters and batch.
+
+    PYTHONPATH=recipes python benchmarks/memory.py 32
+
 
 The argument is the number of target candidates; sizes are HalfCheetah's. Linux and macOS only.
 """
@@ -9,9 +12,9 @@ import resource
 import sys
 
 import torch
-from test_speed import make_actor, make_batch
 from torchrl.objectives import SoftUpdate
 
+from test_speed import make_actor, make_batch
 from torchrl_aca import ACALoss
 
 

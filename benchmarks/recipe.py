@@ -1,23 +1,29 @@
-"""The recipe's own configuration and agent, so that what is timed is what users run."""
+"""The recipe's own configuration and agent, so that what is timed is what users run.
+
+Needs `recipes/` on Python's path: pytest has it there, scripts get it by `PYTHONPATH=recipes`.
+"""
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import hydra
-from omegaconf import DictConfig
+import torch
+from torchrl.envs import EnvBase
 
-RECIPES = Path(__file__).resolve().parents[1] / "recipes"
-sys.path.insert(0, str(RECIPES))
+from agents import configured, make_agent
+from torchrl_aca.training.agent import Agent
+from torchrl_aca.training.config import RunConfig
 
-from aca import make_aca  # noqa: E402
-from online_mujoco import make_collector  # noqa: E402
-
-__all__ = ["configure", "make_aca", "make_collector"]
+CONFIGS = Path(__file__).resolve().parents[1] / "recipes/configs"
 
 
-def configure(*overrides: str) -> DictConfig:
+def configure(*overrides: str) -> RunConfig:
     """The configuration of `python recipes/online_mujoco.py algo=aca OVERRIDES`."""
-    with hydra.initialize_config_dir(str(RECIPES / "configs"), version_base="1.3"):
-        return hydra.compose("online_mujoco", ["algo=aca", *overrides])
+    with hydra.initialize_config_dir(str(CONFIGS), version_base="1.3"):
+        return configured(hydra.compose("online_mujoco", ["algo=aca", *overrides]))
+
+
+def make_recipe_agent(cfg: RunConfig, env: EnvBase) -> Agent:
+    """The agent of that configuration, on the CPU."""
+    return make_agent(cfg, env, torch.device("cpu"))

@@ -10,15 +10,14 @@ import os
 
 import pytest
 import torch
-from recipe import configure, make_aca, make_collector
-from torchrl.modules import RandomPolicy
 
-from torchrl_aca.training.data import EpisodeTracker, make_replay_buffer, transitions
+from recipe import configure, make_recipe_agent
+from torchrl_aca.replay import make_replay_buffer, transitions
+from torchrl_aca.training.collection import Collection
 from torchrl_aca.training.envs import make_vector_env
 from torchrl_aca.training.logging import MetricMeans
 
 torch.set_num_threads(int(os.environ.get("THREADS", os.cpu_count() or 1)))
-DEVICE = torch.device("cpu")
 
 
 @pytest.fixture(scope="module", params=[False, True], ids=["eager", "compiled"])
@@ -28,17 +27,17 @@ def loop(request):
     cfg = configure(
         "aca.num_target_candidates=1",
         f"compile={request.param}",
-        "collector.init_random_frames=500",
+        "collector.warmup_frames=500",
     )
     env = make_vector_env(cfg.env.name, cfg.collector.num_envs, seed=0)
-    agent = make_aca(cfg, env, DEVICE)
-    collector = make_collector(cfg, env, agent, 0, DEVICE)
+    agent = make_recipe_agent(cfg, env)
+    collection = Collection(env, agent.policy, cfg.collector)
     buffer = make_replay_buffer(10000, cfg.optim.batch_size)
-    batches = iter(collector)
+    batches = iter(collection)
     for _ in range(110):
         buffer.extend(transitions(next(batches)))
-    yield cfg, env, agent, collector, batches, buffer, "compiled" if request.param else "eager"
-    collector.shutdown()
+    yield env, agent, batches, buffer, "compiled" if request.param else "eager"
+    collection.close()
 
 
 def measure(benchmark, call, part: str, variant: str) -> None:
@@ -49,21 +48,18 @@ def measure(benchmark, call, part: str, variant: str) -> None:
 
 
 def test_whole_iteration(benchmark, loop):
-    cfg, _, agent, collector, batches, buffer, variant = loop
-    episodes, means = EpisodeTracker(cfg.collector.num_envs), MetricMeans()
+    _, agent, batches, buffer, variant = loop
+    means = MetricMeans()
 
     def iteration():
-        data = next(batches)
-        episodes.add(data)
-        buffer.extend(transitions(data))
-        means.add(agent.update(buffer.sample().to(DEVICE)))
-        collector.update_policy_weights_()
+        buffer.extend(transitions(next(batches)))
+        means.add(agent.update(buffer.sample()))
 
     measure(benchmark, iteration, "whole", variant)
 
 
 def test_acting(benchmark, loop):
-    _, env, agent, *_, variant = loop
+    env, agent, *_, variant = loop
     data = env.reset()
 
     def act():
@@ -74,8 +70,8 @@ def test_acting(benchmark, loop):
 
 
 def test_update(benchmark, loop):
-    *_, buffer, variant = loop
-    agent, batch = loop[2], buffer.sample()
+    _, agent, _, buffer, variant = loop
+    batch = buffer.sample()
     measure(benchmark, lambda: agent.update(batch), "update", variant)
 
 
@@ -91,17 +87,13 @@ def test_buffer(benchmark, loop):
 
 
 def test_collector_without_a_policy(benchmark):
-    """Five environments, the collector, and actions that cost nothing."""
-    cfg = configure()
+    """Five environments, the collector, and actions that cost nothing: those of the warm-up."""
+    cfg = configure("collector.warmup_frames=1000000")
     env = make_vector_env(cfg.env.name, cfg.collector.num_envs, seed=0)
-
-    class Free:
-        policy = RandomPolicy(env.action_spec)
-
-    collector = make_collector(cfg, env, Free, cfg.collector.init_random_frames, DEVICE)
-    batches = iter(collector)
+    collection = Collection(env, make_recipe_agent(cfg, env).policy, cfg.collector)
+    batches = iter(collection)
     measure(benchmark, lambda: next(batches), "collector and environments, random actions", "eager")
-    collector.shutdown()
+    collection.close()
 
 
 def test_environments_alone(benchmark):

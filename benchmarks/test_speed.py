@@ -10,12 +10,12 @@ import os
 
 import pytest
 import torch
-from recipe import configure, make_aca
 from tensordict import TensorDict
-from yardstick import PlainAgent
 
+from recipe import configure, make_recipe_agent
 from torchrl_aca import CriticGuidedDenoisingActor, NoiseLevelCritic, NoiseSchedule
 from torchrl_aca.training.envs import make_vector_env
+from yardstick import PlainAgent
 
 SIZES = {"HalfCheetah": (17, 6), "Humanoid": (376, 17)}
 BATCH, WIDTH, NUM_STEPS = 256, 256, 20
@@ -87,23 +87,21 @@ def test_roofline(benchmark, rows):
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("size", SIZES)
 def test_denoising_step(benchmark, size, variant):
-    """One guided step of a tile."""
+    """One guided step of a tile; for this package with the states' features and the last step."""
     observation_dim, action_dim = SIZES[size]
-    observation, level = torch.randn(BATCH, observation_dim), torch.tensor(7)
-    action, noise = torch.randn(2, 4, BATCH, action_dim)
+    observation, noise = torch.randn(BATCH, observation_dim), torch.randn(3, 4, BATCH, action_dim)
     if variant == "yardstick":
         plain = PlainAgent(*SIZES[size], NUM_STEPS)
         rows = observation.repeat(4, 1)
 
         def call():
-            plain._step(rows, action.flatten(0, 1), level)
+            plain._step(rows, noise[0].flatten(0, 1), torch.tensor(NUM_STEPS))
     else:
-        actor = make_actor(size, variant, 4)
-        features = actor._encode(observation, torch.Size([BATCH]))
+        actor = make_actor(size, variant, 4, num_inference_steps=2)
 
         def call():
             with torch.no_grad():
-                actor._step(features, action, noise, level)
+                actor.denoise(observation, noise)
 
     work = flops(4 * BATCH, action_dim) / (NUM_STEPS - 1)
     measure(benchmark, call, 4 * BATCH, f"{size}: denoising step, 1024 rows", variant, work)
@@ -209,7 +207,7 @@ def test_update(benchmark, size, num_candidates, variant):
             f"compile={variant == 'compiled'}",
         )
         torch._dynamo.reset()
-        agent = make_aca(cfg, make_vector_env(cfg.env.name, 1, seed=0), torch.device("cpu"))
+        agent = make_recipe_agent(cfg, make_vector_env(cfg.env.name, 1, seed=0))
 
         def call():
             agent.update(batch)

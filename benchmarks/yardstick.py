@@ -14,6 +14,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from torchrl_aca import NoiseSchedule
+from torchrl_aca.chain import posterior_step
 from torchrl_aca.functional import sinusoidal_embedding
 
 
@@ -64,9 +65,8 @@ class PlainAgent:
             gradient = gradient / (gradient.norm(dim=-1, keepdim=True) + 1e-8)
             sigma = self.schedule.posterior_variance[level - 1].sqrt().to(action.dtype)
             predicted_noise = -50.0 * sigma * gradient
-            return self.schedule.denoise_step(
-                action, predicted_noise, torch.randn_like(action), level
-            )
+            noise = torch.randn_like(action)
+            return posterior_step(self.schedule, action, predicted_noise, noise, level)
 
     def update(self, batch: TensorDict, num_candidates: int) -> None:
         """A TD step, a noise-level step and a step of the target critics."""

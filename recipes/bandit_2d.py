@@ -18,11 +18,10 @@ import multiprocessing
 import pickle
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import hydra
 import torch
@@ -30,17 +29,20 @@ from omegaconf import DictConfig, OmegaConf
 from torchrl import logger as torchrl_logger
 from torchrl.collectors import Collector
 from torchrl.modules import MLP, ValueOperator
-from torchrl_aca.training.data import make_replay_buffer, transitions
 from tqdm import tqdm
 
 from bandit import tables
+from bandit.config import BanditConfig, variants
 from bandit.env import TwoDBandit, mode_shares, reward
 from bandit.figures import draw_figures
-from bandit.tables import METHODS, Row
+from bandit.tables import Row
 from torchrl_aca import ACALoss, CriticGuidedDenoisingActor, NoiseLevelCritic, NoiseSchedule
 from torchrl_aca.errors import RunError
+from torchrl_aca.replay import make_replay_buffer, transitions
+from torchrl_aca.training.config import checked
 from torchrl_aca.training.randomness import seed_everything
 from torchrl_aca.training.report import versions
+from torchrl_aca.training.run_dir import make_run_dir
 
 Task = tuple[BanditConfig, str, int]  # settings, method, training seed
 
@@ -190,15 +192,26 @@ def ablate(cfg: BanditConfig, run_dir: Path) -> None:
     print(tables.as_text(compact))
 
 
+def begin(cfg: BanditConfig) -> Path:
+    """Makes the directory of this study alone, and writes its configuration there."""
+    run_dir = make_run_dir(cfg.run_dir, "bandit_2d")
+    try:
+        with open(run_dir / "config.yaml", "x") as file:
+            file.write(OmegaConf.to_yaml(OmegaConf.create(cfg.model_dump(exclude_unset=True))))
+    except FileExistsError:
+        raise RunError(
+            f"run_dir={run_dir} already holds a study; expected a new directory. Give another one."
+        ) from None
+    return run_dir
+
+
 @hydra.main(version_base="1.3", config_path="configs", config_name="bandit_2d")
 def main(composed: DictConfig) -> None:
     """Runs the study or its ablation into a new directory; an error is told in one message."""
     try:
         cfg = checked(BanditConfig, composed)
         variants(cfg)  # for their mistakes
-        run_dir = make_run_dir(cfg.run_dir, "bandit_2d")
-        started = lock(run_dir)
-        write_text(run_dir / "config.yaml", OmegaConf.to_yaml(composed))
+        run_dir = begin(cfg)
     except RunError as error:
         raise SystemExit(f"error: {error}") from None
     start, info = time.perf_counter(), versions()

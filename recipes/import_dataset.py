@@ -8,10 +8,11 @@ Every key is in `configs/import_dataset.yaml`.
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import hydra
 from omegaconf import DictConfig
+from pydantic import Field
 
 from data.describe import summary
 from torchrl_aca.errors import DatasetError, RunError
@@ -19,14 +20,15 @@ from torchrl_aca.offline import OfflineDataset, import_d4rl, import_minari
 from torchrl_aca.training.config import Section, checked
 
 IMPORTERS = {"d4rl": import_d4rl, "minari": import_minari}
+Name = Annotated[str, Field(coerce_numbers_to_str=True, strict=False)]  # 2024 may be one
 
 
 class ImporterConfig(Section):
     """`import_dataset.yaml`; what has `Any` is checked by the importer."""
 
-    source: str | int  # a number is a name
+    source: Name
     format: Literal["d4rl", "minari"]
-    path: str | int
+    path: Name
     name: str | None
     env_id: str | None
     reference_scores: Any
@@ -43,7 +45,6 @@ def import_dataset(cfg: DictConfig) -> OfflineDataset:
         RunError: If a key is missing or wrong.
     """
     keywords = checked(ImporterConfig, cfg).model_dump()
-    keywords.update({key: str(keywords[key]) for key in ("source", "path")})
     importer = IMPORTERS[keywords.pop("format")]
     if keywords["action_bounds"] is None:
         del keywords["action_bounds"]

@@ -13,6 +13,7 @@ from __future__ import annotations
 import hydra
 from omegaconf import DictConfig
 
+import renderer  # noqa: F401
 from agents import without_methods
 from data.describe import summary
 from data.generate import GeneratorConfig, make_dataset
@@ -24,13 +25,8 @@ from torchrl_aca.training.config import checked
 def main(cfg: DictConfig) -> None:
     """Generates a data set and says what it holds; an error is told in one message."""
     try:
-        print(
-            summary(
-                make_dataset(
-                    checked(GeneratorConfig, without_methods(cfg, GeneratorConfig.model_fields))
-                )
-            )
-        )
+        kept = without_methods(cfg, GeneratorConfig.model_fields)
+        print(summary(make_dataset(checked(GeneratorConfig, kept))))
     except (DatasetError, RunError) as error:
         raise SystemExit(f"error: {error}") from None
     except KeyboardInterrupt:

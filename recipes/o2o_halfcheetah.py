@@ -20,6 +20,7 @@ import hydra
 from omegaconf import DictConfig
 from pydantic import Field, model_validator
 
+import renderer  # noqa: F401
 from agents import configured, make_agent
 from data.offline import (
     generate_missing,

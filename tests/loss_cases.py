@@ -1,17 +1,28 @@
-"""The small agents and batches that the tests of the loss share."""
+"""The small agents and batches that the tests of the losses share, and the table of all losses."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.data import Bounded
+from torchrl.modules import MLP, NormalParamExtractor, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import SoftUpdate
 
 from torchrl_aca import ACALoss, CriticGuidedDenoisingActor, NoiseLevelCritic, NoiseSchedule
+from torchrl_aca.baselines import EnsembleMLP, EnsembleSACLoss
 
 OBSERVATION_DIM, ACTION_DIM, NUM_STEPS = 3, 2, 4
+LOW, HIGH = torch.tensor([-2.0, -1.0]).double(), torch.tensor([1.0, 3.0]).double()
+
+# --- ACA ------------------------------------------------------------------------------------------
 
 
-def make_actor(critic=None, *, first_level=1, **kwargs):
+def make_actor(critic=None, *, first_level=1, state="observation", **kwargs):
     if critic is None:
         critic = NoiseLevelCritic(
             OBSERVATION_DIM,
@@ -19,6 +30,7 @@ def make_actor(critic=None, *, first_level=1, **kwargs):
             num_steps=NUM_STEPS,
             num_cells=(16, 16),
             first_level=first_level,
+            in_keys=[state, "action", "noise_level"],
         )
     kwargs = {"num_candidates": 3, **kwargs}
     return CriticGuidedDenoisingActor(critic, NoiseSchedule.cosine(NUM_STEPS), **kwargs)
@@ -32,6 +44,11 @@ def make_loss(actor=None, **kwargs):
         for param in loss.target_qvalue_network_params.values(True, True):
             param.data.add_(0.1 * torch.randn_like(param))
     return loss
+
+
+def make_aca(state="observation", action="action", **kwargs):
+    """An ACA loss on such keys."""
+    return make_loss(make_actor(state=state, out_keys=[action]), **kwargs)
 
 
 def make_data(*batch, terminated=False, draws=False):
@@ -69,3 +86,106 @@ def set_constant(loss, online, target):
     ):
         params["value", "weight"].data.zero_()
         params["value", "bias"].data.fill_(value)
+
+
+# --- RLPD -----------------------------------------------------------------------------------------
+
+
+def make_policy(state="observation", action="action", spec=True):
+    network = nn.Sequential(
+        MLP(OBSERVATION_DIM, 2 * ACTION_DIM, num_cells=[8], activation_class=nn.ReLU).double(),
+        NormalParamExtractor(scale_mapping="exp"),
+    )
+    return ProbabilisticActor(
+        TensorDictModule(network, in_keys=[state], out_keys=["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        out_keys=[action],
+        spec=Bounded(LOW, HIGH, (ACTION_DIM,), dtype=torch.float64) if spec else None,
+        distribution_class=TanhNormal,
+        distribution_kwargs={"low": LOW, "high": HIGH},
+    )
+
+
+def make_rlpd(state="observation", action="action", policy=None, num_members=4, **kwargs):
+    """A loss with no parameter at a special value, and targets that differ from the critics."""
+    num_in = OBSERVATION_DIM + ACTION_DIM
+    network = EnsembleMLP(num_in, num_members, num_cells=(6, 5), dtype=torch.float64)
+    critics = ValueOperator(network, in_keys=[state, action])
+    loss = EnsembleSACLoss(policy or make_policy(state, action), critics, **kwargs)
+    loss.make_value_estimator(gamma=0.875)
+    SoftUpdate(loss, tau=0.1)
+    for params in (loss.qvalue_network_params, loss.target_qvalue_network_params):
+        for param in params.values(True, True):
+            param.data.add_(0.3 * torch.randn_like(param))
+        # Members apart from row to row rather than everywhere: so each is the smallest somewhere.
+        last = params["module", "layers", "6"]
+        last["bias"].data.zero_()
+        last["weight"].data.sub_(last["weight"].data.mean(1, keepdim=True))
+    loss.raw_alpha.data.fill_(0.3)
+    return loss
+
+
+def make_rlpd_data(*batch):
+    terminated = torch.zeros(*batch, 1, dtype=torch.bool)
+    terminated.view(-1)[::3] = True
+    following = {
+        "observation": torch.randn(*batch, OBSERVATION_DIM, dtype=torch.float64),
+        "reward": torch.randn(*batch, 1, dtype=torch.float64),
+        "done": torch.ones_like(terminated),  # time limits, which must not stop the bootstrap
+        "terminated": terminated,
+    }
+    unit = torch.rand(*batch, ACTION_DIM, dtype=torch.float64)
+    return TensorDict(
+        observation=torch.randn(*batch, OBSERVATION_DIM, dtype=torch.float64),
+        action=LOW + unit * (HIGH - LOW),
+        next=TensorDict(following, batch_size=batch),
+        batch_size=batch,
+    )
+
+
+# --- all losses -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class LossCase:
+    """What the battery needs of a loss.
+
+    ``make(state=KEY, action=KEY, **kwargs)`` gives one with targets apart from the critics and an
+    updater; ``data(*batch)`` gives transitions, and whatever else it may read; ``parts`` are its
+    losses by method name, in the order of ``forward``; ``metrics`` are its metrics and ``written``
+    the entries that it adds to its input.
+    """
+
+    make: Callable
+    data: Callable
+    parts: tuple[str, ...]
+    metrics: frozenset[str]
+    written: frozenset[str]
+
+    @property
+    def losses(self) -> set[str]:
+        return {f"loss_{part.removesuffix('_loss')}" for part in self.parts}
+
+
+def make_aca_data(*batch):
+    return make_data(*batch, draws=True)
+
+
+CASES = {
+    "aca": LossCase(
+        make_aca,
+        make_aca_data,
+        ("qvalue_loss", "noise_level_loss", "alpha_loss"),
+        frozenset(
+            {"pred_value", "target_value", "noisy_value", "alpha", "entropy", "exploration_std"}
+        ),
+        frozenset({"td_error"}),
+    ),
+    "rlpd": LossCase(
+        make_rlpd,
+        make_rlpd_data,
+        ("qvalue_loss", "actor_loss", "alpha_loss"),
+        frozenset({"pred_value", "target_value", "entropy", "alpha"}),
+        frozenset({"policy_log_prob"}),
+    ),
+}

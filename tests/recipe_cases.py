@@ -18,6 +18,37 @@ ROOT = Path(__file__).parents[1]
 RECIPES = ROOT / "recipes"
 CONFIGS = RECIPES / "configs"
 
+# A run of seconds, for every entry of AGENTS: sizes that show whatever a checkpoint could miss.
+TINY_RUN = [
+    "env=hopper",
+    "num_threads=1",
+    "collector.warmup_frames=200",
+    "buffer.capacity=300",
+    "optim.batch_size=16",
+    "optim.total_updates=60",
+    "eval.interval=30",
+    "eval.episodes=2",
+    "checkpoint.interval=25",
+    "logger.interval=10",
+]
+TINY_SIZES = {
+    "aca": [
+        "aca.num_cells=[16,16]",
+        "aca.num_steps=3",
+        "aca.num_candidates=3",
+        "aca.num_target_candidates=2",
+        "aca.alpha_interval=20",
+    ],
+    "rlpd": [
+        "rlpd.num_cells=[16,16]",
+        "rlpd.num_qvalue_nets=3",
+        "rlpd.actor_interval=7",  # so that the run stops between two steps of the actor
+        "optim.utd_ratio=0.4",
+    ],
+    "sac": ["sac.num_cells=[16,16]"],
+}
+TINY = {algo: [f"algo={algo}", *TINY_RUN, *sizes] for algo, sizes in TINY_SIZES.items()}
+
 
 def start(*arguments: str, cwd: Path, recipe: str = "online_mujoco") -> subprocess.Popen:
     """A recipe's command, running."""

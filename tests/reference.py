@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.objectives import SoftUpdate
@@ -19,12 +17,8 @@ TARGETS = ("target_q1", "target_q2")
 
 
 def load_recording():
-    """The arrays recorded from the official implementation; skips the test without the file."""
-    default = Path(__file__).resolve().parents[1].parent / "shared/reference/aca_update.npz"
-    path = Path(os.environ.get("TORCHRL_ACA_REFERENCE", default))
-    if not path.is_file():
-        pytest.skip(f"no recording at {path}; set TORCHRL_ACA_REFERENCE to aca_update.npz")
-    with np.load(path) as file:
+    """The arrays recorded from the official implementation; `data/README.md` describes them."""
+    with np.load(Path(__file__).parent / "data/aca_update.npz") as file:
         return {key: file[key] for key in file.files}
 
 
@@ -62,7 +56,7 @@ class OfficialAgent:
         self, critics, targets, log_alpha, action_dim, num_steps, *,
         first_level=0, dtype=torch.float64, noise_level_target="mean", **actor_kwargs,
     ):  # fmt: skip
-        self.dtype = dtype
+        self.dtype, self.first_level = dtype, first_level
         sizes = (action_dim, num_steps, first_level, dtype)
         self.critic = make_critic(critics, *sizes)
         schedule = NoiseSchedule.cosine(num_steps)
@@ -104,7 +98,8 @@ class OfficialAgent:
             observation=t(batch["obs"]),
             action=t(batch["action"]),
             next_action=self.action(batch["next_obs"], draws),
-            noise_level=torch.as_tensor(draws["t"]).long(),
+            # `t` counts the noisy levels from `first_level`, as the oracle and the recording do.
+            noise_level=torch.as_tensor(draws["t"]).long() + 1 - self.first_level,
             noise=t(draws["noise"]),
             next=TensorDict(following, batch_size=size),
             batch_size=size,

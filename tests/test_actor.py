@@ -4,7 +4,6 @@ import copy
 import pickle
 
 import numpy as np
-import oracle
 import pytest
 import torch
 from tensordict import TensorDict
@@ -14,6 +13,7 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.testing.mocking_classes import ContinuousActionVecMockEnv
 
+import oracle
 from torchrl_aca import (
     CriticGuidedDenoisingActor,
     NoiseLevelCritic,
@@ -149,7 +149,13 @@ def test_trajectory_begins_at_the_noise_and_ends_at_the_candidates(sampler):
 
 
 @pytest.mark.parametrize(
-    "bad", [{"sampler": "gibbs"}, {"langevin_step_size": 0.0}, {"clip_denoised": -1.0}]
+    "bad",
+    [
+        {"sampler": "gibbs"},
+        {"deterministic_draws": "other"},
+        {"langevin_step_size": 0.0},
+        {"clip_denoised": -1.0},
+    ],
 )
 def test_sampler_must_be_known_and_its_numbers_in_range(bad):
     (name,) = bad
@@ -307,6 +313,23 @@ def test_actors_built_after_other_draws_have_the_same_fixed_noise():
     first = make_actor(critic)
     torch.randn(7)
     assert torch.equal(make_actor(critic).fixed_noise, first.fixed_noise)
+
+
+def test_deterministic_calls_may_draw_afresh_and_still_explore_nothing():
+    critic, td = make_critic(), observe(BATCH)
+    actor = make_actor(critic, deterministic_draws="fresh")
+    quiet = make_actor(critic, exploration_noise=0.0)
+    with DETERMINISTIC:
+        action = act(actor, td, seed=1)
+        assert not torch.equal(act(actor, td, seed=2), action)
+    assert torch.equal(action, act(quiet, td, seed=1))
+    many = actor.sample(td["observation"], [BATCH], num_candidates=99, deterministic=True)
+    assert many.shape == (BATCH, ACTION)
+
+
+def test_explore_adds_the_draw_scaled_by_alpha():
+    actor, (action, draw) = make_actor(exploration_noise=0.3, alpha_init=4.0), torch.randn(2, 5, 3)
+    torch.testing.assert_close(actor.explore(action, draw), action + 1.2 * draw)
 
 
 def test_building_an_actor_leaves_the_global_random_state_alone():
@@ -537,7 +560,28 @@ def test_the_actor_owns_no_network():
     assert actor.critic is critic
     own = {name for name, _ in actor.named_parameters() if not name.startswith("critic.")}
     assert own == {"log_alpha"} and actor.log_alpha.shape == ()
-    assert set(actor.state_dict()) == {"log_alpha", *(f"critic.{k}" for k in critic.state_dict())}
+    networks = {f"critic.{key}" for key in critic.state_dict()}
+    assert set(actor.state_dict()) == {"log_alpha", "guidance_weight", *networks}
+
+
+def test_the_guidance_weight_is_a_number_to_set_and_part_of_the_state():
+    actor, held = make_actor(guidance_weight=0.3), observe(BATCH)
+    buffer = actor.guidance_weight
+    actor.guidance_weight = 7
+    assert actor.guidance_weight is buffer and buffer == 7
+    other = make_actor(actor.critic)
+    other.load_state_dict(actor.state_dict())
+    assert other.guidance_weight == 7
+    assert torch.equal(act(other, held, seed=0), act(actor, held, seed=0))
+    other.guidance_weight = 0.0
+    assert not torch.equal(act(other, held, seed=0), act(actor, held, seed=0))
+    with pytest.raises(ValueError, match="guidance_weight >= 0, got guidance_weight=-1"):
+        actor.guidance_weight = -1
+
+
+def test_casts_round_no_guidance_weight():
+    actor = make_actor(guidance_weight=0.1).half().double()
+    assert actor.guidance_weight.item() == 0.1
 
 
 def test_casts_reach_all_but_the_schedule():
@@ -578,8 +622,8 @@ def test_the_written_out_gradient_gives_the_generic_chain(
     observation = torch.randn(BATCH, OBS, dtype=dtype)
     noise = torch.randn(T + 1, CANDIDATES, BATCH, ACTION, dtype=dtype)
     fast = actor.denoise(observation, noise)
-    generic = NoiseLevelCriticBase.action_gradient.__get__(critic)
-    monkeypatch.setattr(critic, "action_gradient", generic, raising=True)
+    generic = NoiseLevelCriticBase._action_gradient.__get__(critic)
+    monkeypatch.setattr(critic, "_action_gradient", generic, raising=True)
     torch.testing.assert_close(fast, actor.denoise(observation, noise), rtol=0, atol=tolerance)
 
 
@@ -711,7 +755,7 @@ def test_a_spawned_worker_acts_as_the_learner_before_and_after_an_update(
     assert not torch.allclose(first["action"], learners_action(first), atol=1e-2)
 
 
-def test_log_alpha_reaches_a_spawned_worker(collect_from_spawned_worker):
+def test_what_is_set_reaches_a_spawned_worker(collect_from_spawned_worker):
     actor = collecting_actor()
     collector, batches = collect_from_spawned_worker(actor)
     assert not actor.spec["action"].is_in(next(batches)["action"])  # loud exploration noise
@@ -720,3 +764,16 @@ def test_log_alpha_reaches_a_spawned_worker(collect_from_spawned_worker):
     collector.update_policy_weights_()
     next(batches)  # may have begun before the update
     assert actor.spec["action"].is_in(next(batches)["action"])
+
+
+def test_the_guidance_weight_reaches_a_spawned_worker(collect_from_spawned_worker):
+    actor = collecting_actor()
+    kind = ExplorationType.DETERMINISTIC
+    collector, batches = collect_from_spawned_worker(actor, exploration_type=kind)
+    next(batches)
+    actor.guidance_weight = 0.0
+    collector.update_policy_weights_()
+    next(batches)  # may have begun before the update
+    batch = next(batches).clone()
+    unguided = actor.sample(batch["observation"], batch.shape, deterministic=True)
+    torch.testing.assert_close(batch["action"], unguided, rtol=0, atol=1e-3)

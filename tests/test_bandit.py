@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import csv
 import itertools
-import os
-import subprocess
-import sys
-from pathlib import Path
+import re
 
 import numpy as np
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 from torchrl.envs.utils import check_env_specs
 
-ROOT = Path(__file__).parents[1]
-RECIPES = ROOT / "recipes"
+import bandit_2d
+import recipe_cases
+from bandit.config import BanditConfig, variants
+from bandit.env import TwoDBandit, mode_shares, reward
+from recipe_cases import rows_of
+from torchrl_aca.errors import RunError
+from torchrl_aca.training.config import checked
+
 METHODS = ("aca", "diffusion_q", "langevin_q")
 HIGH = np.sqrt(2) * np.array([[0, 1], [1, 0], [0, -1], [-1, 0]])  # top, right, bottom, left
 SMALL = [
@@ -43,29 +43,8 @@ TINY = [
 ]
 
 
-@pytest.fixture(scope="module", autouse=True)
-def import_recipes():
-    sys.path.insert(0, str(RECIPES))
-    yield
-    sys.path.remove(str(RECIPES))
-
-
-def composed(*overrides: str, name: str = "bandit_2d"):
-    with initialize_config_dir(str(RECIPES / "configs"), version_base="1.3"):
-        return compose(name, overrides=list(overrides))
-
-
-def start(*arguments: str, cwd: Path) -> subprocess.CompletedProcess:
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, str(RECIPES / "bandit_2d.py"), *arguments]
-    return subprocess.run(
-        command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=120
-    )
-
-
-def rows(path: Path) -> list[dict[str, str]]:
-    with open(path, newline="") as file:
-        return list(csv.DictReader(file))
+def composed(*overrides: str, name: str = "bandit_2d") -> BanditConfig:
+    return checked(BanditConfig, recipe_cases.composed(*overrides, name=name))
 
 
 # --- the environment ------------------------------------------------------------------------------
@@ -84,8 +63,6 @@ def oracle_density(actions):
 
 
 def test_reward_is_the_mixtures_density_scaled_to_one():
-    from bandit.env import TwoDBandit
-
     actions = np.random.default_rng(0).uniform(-2.5, 2.5, (500, 2))
     line = np.linspace(-1.5, 1.5, 1501)
     highest = oracle_density(np.stack(np.meshgrid(line, line), -1)).max()
@@ -96,8 +73,6 @@ def test_reward_is_the_mixtures_density_scaled_to_one():
 
 
 def test_highest_reward_is_one_and_the_low_modes_have_half():
-    from bandit.env import reward
-
     line = torch.linspace(-2, 2, 1001)
     assert reward(torch.cartesian_prod(line, line)).max().item() == pytest.approx(1, abs=1e-4)
     assert reward(torch.tensor([1.0, 1.0])).item() == pytest.approx(0.502, abs=1e-3)
@@ -105,8 +80,6 @@ def test_highest_reward_is_one_and_the_low_modes_have_half():
 
 @pytest.mark.parametrize("num_envs", [1, 7])
 def test_env_keeps_its_specs_and_ends_after_one_step(num_envs):
-    from bandit.env import TwoDBandit
-
     env = TwoDBandit(num_envs, half_width=2.5)
     check_env_specs(env)
     rollout = env.rollout(5)
@@ -116,8 +89,6 @@ def test_env_keeps_its_specs_and_ends_after_one_step(num_envs):
 
 
 def test_shares_count_what_lies_within_the_radius_in_the_papers_order():
-    from bandit.env import mode_shares
-
     near = HIGH + np.array([0.29, 0.0])
     far = HIGH + np.array([0.0, 0.31])
     actions = np.concatenate([near[:1], near[:1], near[1:], far, [[1, 1]]])  # 2, 1, 1, 1 of 10
@@ -131,17 +102,13 @@ def test_shares_count_what_lies_within_the_radius_in_the_papers_order():
 
 @pytest.mark.slow
 def test_aca_finds_all_high_modes_with_more_samples_than_the_plain_critic():
-    from bandit_2d import run
-
     cfg = composed(*SMALL)
-    noisy, plain = (run((cfg, method, 0))[0][0] for method in ("aca", "diffusion_q"))
+    noisy, plain = (bandit_2d.run((cfg, method, 0))[0][0] for method in ("aca", "diffusion_q"))
     assert min(noisy[name] for name in ("top", "right", "bottom", "left")) > 0.15
     assert noisy["sum"] > plain["sum"] + 0.05
 
 
 def test_weight_is_chosen_by_reward_alone(monkeypatch):
-    import bandit_2d
-
     measured = iter([{"sum": 0.9, "reward_mean": 0.1}, {"sum": 0.1, "reward_mean": 0.9}])
     monkeypatch.setattr(bandit_2d, "measure", lambda actions: next(measured))
     cfg = composed(*TINY)
@@ -152,8 +119,6 @@ def test_weight_is_chosen_by_reward_alone(monkeypatch):
 
 @pytest.mark.parametrize("data", ["uniform", "online"])
 def test_data_comes_from_the_box_or_from_the_method_as_well(data, monkeypatch):
-    import bandit_2d
-
     seen = []
     transitions = bandit_2d.transitions
     monkeypatch.setattr(
@@ -165,60 +130,93 @@ def test_data_comes_from_the_box_or_from_the_method_as_well(data, monkeypatch):
 
 
 def test_command_writes_all_its_files(tmp_path):
-    result = start(*TINY, "run_dir=run", cwd=tmp_path)
-    assert result.returncode == 0, result.stderr
+    code, output, errors = recipe_cases.run(*TINY, "run_dir=run", cwd=tmp_path, recipe="bandit_2d")
+    assert code == 0, errors
     figures = {"reward.png", "samples.png", "sensitivity.png", "value_maps.png", "steps.gif"}
     figures |= {f"steps_{method}.png" for method in METHODS}
     tables = {"table.csv", "seeds.csv", "sweep.csv", "config.yaml", "card.md"}
     assert {path.name for path in (tmp_path / "run").iterdir()} == figures | tables
-    table = rows(tmp_path / "run" / "table.csv")
+    table = rows_of(tmp_path / "run" / "table.csv")
     assert [row["source"] for row in table] == ["here, 1 seeds", "paper"] * 3
     assert [row["sum"] for row in table[1::2]] == ["0.993", "0.636", "0.570"]
-    assert len(rows(tmp_path / "run" / "sweep.csv")) == 2 * len(METHODS)
-    assert "ACA" in result.stdout and "3/3" in result.stderr
+    assert len(rows_of(tmp_path / "run" / "sweep.csv")) == 2 * len(METHODS)
+    assert "ACA" in output and "3/3" in errors
 
 
 def test_ablation_has_a_row_for_each_combination(tmp_path):
-    import bandit_2d
-
     changes = ["methods=[aca]", "ablation.training.data=[uniform,online]"]
     bandit_2d.ablate(composed(*TINY, *changes, name="bandit_2d_ablation"), tmp_path)
-    table = rows(tmp_path / "ablation.csv")
+    table = rows_of(tmp_path / "ablation.csv")
     keys = ("chain.schedule", "data", "clip_denoised", "normalize_gradient")
     values = [("linear", "cosine"), ("uniform", "online"), ("False", "2.0"), ("True", "False")]
     expected = list(itertools.product(*values))
     assert [tuple(row[key] for key in keys) for row in table] == expected
-    compact = rows(tmp_path / "ablation_table.csv")
+    compact = rows_of(tmp_path / "ablation_table.csv")
     assert [tuple(row[key] for key in keys) for row in compact] == expected
     assert [float(row["ACA sum"]) for row in compact] == [
         pytest.approx(float(row["sum"]), abs=1e-3) for row in table
     ]
 
 
-def test_ablation_config_composes_and_its_values_are_valid():
-    import bandit_2d
-
+def test_the_ablation_has_a_configuration_for_each_training():
     cfg = composed(name="bandit_2d_ablation")
-    for changed in bandit_2d.combinations(cfg.ablation.training):
-        for key, value in changed.items():
-            OmegaConf.update(cfg, key, value)
-        bandit_2d.validate(cfg)
-        actor = bandit_2d.make_actor(cfg, "aca")
-    assert all(hasattr(actor, name) for name in cfg.ablation.sampling)
+    made = variants(cfg)
+    assert [(v.chain.schedule, v.data) for _, v in made] == [
+        tuple(changed.values()) for changed, _ in made
+    ]
+    assert len({(v.chain.schedule, v.data) for _, v in made}) == 4
+    actor = bandit_2d.make_actor(cfg, "aca")
+    assert all(hasattr(actor, name) for name in cfg.ablation.samplings()[0])
+
+
+def test_studies_of_the_same_second_never_share_a_directory(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("time.strftime", lambda form: "now")
+    made = [bandit_2d.begin(composed()) for _ in range(3)]
+    assert [path.name for path in made] == ["bandit_2d-now", "bandit_2d-now-2", "bandit_2d-now-3"]
+    with pytest.raises(RunError, match="bandit_2d-now-2 already holds a study"):
+        bandit_2d.begin(composed(f"run_dir={made[1]}"))
+
+
+# --- mistakes -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("data=offline", "data=offline: expected uniform or online"),
-        ("chain.schedule=quadratic", "chain.schedule=quadratic: expected one of"),
-        ("methods=[sac]", "expected some of"),
-        ("seeds=[]", "expected at least one seed"),
-        ("collector.frames=30001", "expected a multiple of frames_per_batch, 500"),
+        ("data=offline", "data='offline': expected 'online' or 'uniform'"),
+        ("chain.schedule=quadratic", "chain.schedule='quadratic': expected 'linear', 'cosine' or"),
+        ("methods=[sac]", "methods.0='sac': expected 'aca', 'diffusion_q' or 'langevin_q'"),
+        ("methods=[]", "methods=[]: expected"),
+        ("seeds=[]", "seeds=[]: expected"),
+        ("seeds=0", "seeds=0: expected a valid list"),
+        ("collector.frames=30001", "collector.frames=30001: expected a multiple of"),
+        ("collector.frames_per_batch=0", "collector.frames_per_batch=0: expected greater than"),
+        ("collector.guidance_weight=5", "collector.guidance_weight=5: expected"),
+        ("~collector.guidance_weight.aca", "expected a weight for ['aca'] as well"),
+        ("chain.num_steps=abc", "chain.num_steps='abc': expected a valid integer"),
+        ("chain.clip_denoised=true", "chain.clip_denoised=True: expected false, or a number above"),
+        ("chain.clip_denoised=-1", "chain.clip_denoised=-1: expected false, or a number above 0"),
+        ("chain.linear=5", "chain.linear=5: expected a section"),
+        ("optim.lr=abc", "optim.lr='abc': expected a valid number"),
+        ("optim.lr=nan", "optim.lr=nan: expected a finite number"),
+        ("critic.num_cells=5", "critic.num_cells=5: expected a valid list"),
+        ("sweep.weights=[10,-1]", "sweep.weights.1=-1: expected greater than or equal to 0"),
+        ("run_dir=5", "run_dir=5: expected a valid string"),
+        ("+speed=3", "speed=3: there is no such key"),
+        ("+ablation.sampling.speed=[3]", "ablation.sampling.speed=[3]: there is no such key"),
+        ("+ablation.sampling.clip_denoised=[x]", "clip_denoised.0='x': expected false, or"),
+        ("+ablation.training={optim.lr: 3}", "ablation.training.optim.lr=3: expected a valid list"),
+        ("+ablation.training={optim.lr: [x]}", "optim.lr='x': expected a valid number"),
+        ("+ablation.training={optim.rate: [3]}", "optim.rate=3: there is no such key"),
     ],
 )
 def test_wrong_settings_are_told_before_any_work(override, message):
-    import bandit_2d
+    with pytest.raises(RunError, match=re.escape(message)):
+        variants(composed(override))
 
-    with pytest.raises(bandit_2d.RunError, match=message.replace("[", r"\[")):
-        bandit_2d.validate(composed(override))
+
+def test_a_mistake_ends_in_one_message_and_leaves_nothing(tmp_path):
+    code, _, errors = recipe_cases.run("optim.lr=abc", cwd=tmp_path, recipe="bandit_2d")
+    assert code == 1 and not list(tmp_path.iterdir())
+    assert errors == "error: optim.lr='abc': expected a valid number. Set it with optim.lr=... .\n"

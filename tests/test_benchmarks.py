@@ -2,19 +2,12 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
-import pytest
 import torch
 
+from report import loop_overhead, table
 from torchrl_aca import CriticGuidedDenoisingActor, NoiseLevelCritic, NoiseSchedule
 from torchrl_aca.interop import load_official
-
-
-@pytest.fixture(autouse=True)
-def benchmarks_on_the_path(monkeypatch):
-    monkeypatch.setattr(sys, "path", [str(Path(__file__).parents[1] / "benchmarks"), *sys.path])
+from yardstick import PlainAgent
 
 
 def official(critic) -> dict:
@@ -29,8 +22,6 @@ def official(critic) -> dict:
 
 
 def test_the_yardstick_samples_what_the_actor_samples(monkeypatch):
-    from yardstick import PlainAgent
-
     num_steps, num_candidates, batch, action_dim = 4, 3, 5, 2
     plain = PlainAgent(7, action_dim, num_steps)
     critic = NoiseLevelCritic(7, action_dim, num_steps=num_steps)
@@ -49,8 +40,6 @@ def test_the_yardstick_samples_what_the_actor_samples(monkeypatch):
 
 
 def test_the_report_divides_by_yardstick_and_roofline():
-    from report import table
-
     def result(case, variant, rows, flops, seconds):
         info = {"case": case, "variant": variant, "rows": rows, "flops": flops}
         return {"extra_info": info, "stats": {"median": seconds}}
@@ -71,8 +60,6 @@ def test_the_report_divides_by_yardstick_and_roofline():
 
 
 def test_the_report_tells_what_the_loop_costs():
-    from report import loop_overhead
-
     def part(name, seconds, variant="compiled"):
         info = {"case": f"iteration, N = 1: {name}", "variant": variant}
         return {"extra_info": info, "stats": {"median": seconds}}

@@ -4,12 +4,12 @@ import copy
 import pickle
 
 import numpy as np
-import oracle
 import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
 
+import oracle
 from torchrl_aca import NoiseLevelCritic, NoiseLevelCriticBase
 from torchrl_aca.interop import to_official
 
@@ -42,10 +42,11 @@ def draw(*batch, dtype=torch.float32):
 def test_values_equal_the_oracle(first_level, num_critics):
     critic = make_critic(first_level=first_level, num_critics=num_critics, dtype=torch.float64)
     observation, action = draw(BATCH, dtype=torch.float64)
-    level = torch.randint(0, T + first_level, (BATCH,))
+    level = torch.arange(BATCH) * 4  # 0, 4, .. 20
+    index = level if first_level else (level - 1).clamp(min=0)  # the official code's
     value = critic(observation, action, level)
     assert value.shape == (BATCH, num_critics)
-    arrays = observation.numpy(), action.numpy(), level.numpy()
+    arrays = observation.numpy(), action.numpy(), index.numpy()
     expected = [oracle.critic(member, *arrays) for member in to_official(critic)]
     np.testing.assert_allclose(value.detach(), np.stack(expected, -1), atol=1e-12)
 
@@ -86,14 +87,17 @@ def test_every_batch_shape_gives_the_values_of_the_flat_batch(batch):
     torch.testing.assert_close(critic(observation, action, level), value)
 
 
-@pytest.mark.parametrize(("first_level", "num_levels"), [(0, T), (1, T + 1)])
-def test_levels_have_indices_of_their_own(first_level, num_levels):
+@pytest.mark.parametrize("first_level", [0, 1])
+def test_levels_0_to_t_have_values_of_their_own_but_0_and_1_of_the_official_code(first_level):
     critic = make_critic(first_level=first_level)
-    observation, action = torch.zeros(num_levels, OBS), torch.zeros(num_levels, ACTION)
-    value = critic(observation, action, torch.arange(num_levels))
-    assert value.detach()[:, 0].unique().numel() == num_levels
+    observation, action = torch.zeros(T + 1, OBS), torch.zeros(T + 1, ACTION)
+    value = critic(observation, action, torch.arange(T + 1)).detach()[:, 0]
+    assert value.unique().numel() == T + first_level
+    assert torch.equal(value[0], value[1]) is (first_level == 0)
+    gradient = critic.action_gradient(critic.encode(observation), action, torch.arange(T + 1))
+    assert torch.allclose(gradient[0], gradient[1]) is (first_level == 0)
     with pytest.raises(IndexError):
-        critic(observation[0], action[0], torch.tensor(num_levels))
+        critic(observation[0], action[0], torch.tensor(T + 1))
 
 
 def test_float64_observations_are_cast_to_the_parameters():
@@ -155,7 +159,7 @@ def test_written_out_gradient_equals_the_generic_one(activation, num_cells):
     action = torch.randn(CANDIDATES, BATCH, ACTION, dtype=torch.float64)
     level = torch.randint(0, T + 1, (BATCH,))
     written = critic.action_gradient(features, action, level)
-    generic = NoiseLevelCriticBase.action_gradient(critic, features, action, level)
+    generic = NoiseLevelCriticBase._action_gradient(critic, features, action, level)
     torch.testing.assert_close(written, generic, rtol=0, atol=1e-10)
 
 
@@ -164,10 +168,11 @@ def test_written_out_gradient_equals_the_generic_one(activation, num_cells):
 def test_action_gradient_works_in_every_grad_mode_and_keeps_no_graph(mode, owner):
     critic = make_critic()
     observation, action = draw(BATCH)
-    expected = owner.action_gradient(critic, critic.encode(observation), action, torch.tensor(2))
+    level = torch.tensor(2)
+    expected = owner._action_gradient(critic, critic.encode(observation), action, level)
     with mode():
         features = critic.encode(observation)
-        gradient = owner.action_gradient(critic, features, action, torch.tensor(2))
+        gradient = owner._action_gradient(critic, features, action, level)
     assert not gradient.requires_grad
     torch.testing.assert_close(gradient, expected)
 
@@ -264,14 +269,17 @@ def test_first_level_is_0_or_1(first_level):
         make_critic(first_level=first_level)
 
 
-@pytest.mark.parametrize("method", ["encode", "evaluate"])
-def test_the_base_names_the_method_that_a_subclass_lacks(method):
+@pytest.mark.parametrize(
+    ("method", "missing"),
+    [("encode", "encode"), ("evaluate", "_evaluate"), ("action_gradient", "_evaluate")],
+)
+def test_the_base_names_the_method_that_a_subclass_lacks(method, missing):
     class Unfinished(NoiseLevelCriticBase):
         pass
 
-    arguments = {"encode": 1, "evaluate": 3}[method]
-    with pytest.raises(NotImplementedError, match=f"Unfinished must define {method}"):
-        getattr(Unfinished(), method)(*[torch.zeros(1)] * arguments)
+    arguments = [torch.zeros(1)] * (1 if method == "encode" else 3)
+    with pytest.raises(NotImplementedError, match=f"Unfinished must define {missing}"):
+        getattr(Unfinished(), method)(*arguments)
 
 
 @pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda c: pickle.loads(pickle.dumps(c))])

@@ -63,7 +63,8 @@ def test_posterior_mean_by_hand():
 
 def test_langevin_step_by_hand():
     # 1 + 0.04/2 * 3 * 2 + 0.2 * (-0.5) = 1 + 0.12 - 0.1 = 1.02.
-    close(F.langevin_step(tensor(1.0), tensor(2.0), 3.0, 0.04, tensor(-0.5)), tensor(1.02))
+    step_size = tensor(0.04)[0]
+    close(F.langevin_step(tensor(1.0), tensor(2.0), 3.0, step_size, tensor(-0.5)), tensor(1.02))
 
 
 def test_sinusoidal_embedding_by_hand():
@@ -84,20 +85,32 @@ def test_mish_and_slope_by_hand():
     close(slope, tensor(0.6))
 
 
-@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 2e-6), (torch.float64, 5e-15)])
+MISH_DTYPES = [
+    (torch.float16, 1e-3),
+    (torch.bfloat16, 1e-2),
+    (torch.float32, 2e-6),
+    (torch.float64, 5e-15),
+]
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), MISH_DTYPES)
 def test_mish_and_slope_agree_with_autograd_and_stay_finite(dtype, tolerance):
-    x = torch.linspace(-100, 100, 20_001, dtype=dtype).requires_grad_()
-    expected = nn.functional.mish(x)
-    (expected_slope,) = torch.autograd.grad(expected.sum(), x)
-    value, slope = F.mish_and_slope(x.detach())
+    x = torch.linspace(-100, 100, 20_001, dtype=dtype)
+    exact = x.double().requires_grad_()
+    expected = nn.functional.mish(exact)
+    (expected_slope,) = torch.autograd.grad(expected.sum(), exact)
+    value, slope = F.mish_and_slope(x)
+    assert value.dtype == slope.dtype == dtype
     assert value.isfinite().all() and slope.isfinite().all()
-    torch.testing.assert_close(value, expected.detach(), rtol=tolerance, atol=tolerance)
-    torch.testing.assert_close(slope, expected_slope, rtol=tolerance, atol=tolerance)
+    torch.testing.assert_close(value.double(), expected.detach(), rtol=tolerance, atol=tolerance)
+    torch.testing.assert_close(slope.double(), expected_slope, rtol=tolerance, atol=tolerance)
 
 
-@pytest.mark.parametrize("x", [50.0, 1e6, 1e15])
-def test_slope_of_mish_is_one_for_large_numbers(x):
-    assert F.mish_and_slope(tensor(x))[1].item() == 1
+@pytest.mark.parametrize("dtype", [dtype for dtype, _ in MISH_DTYPES])
+def test_slope_of_mish_is_one_up_to_the_largest_number(dtype):
+    large = torch.tensor([50.0, 1e3, torch.finfo(dtype).max], dtype=dtype)
+    value, slope = F.mish_and_slope(large)
+    assert torch.equal(value, large) and (slope == 1).all()
 
 
 ACTIVATIONS = [nn.Mish, nn.ReLU, nn.GELU, nn.SiLU, nn.Tanh, nn.ELU, nn.Softplus, nn.LeakyReLU]

@@ -4,6 +4,12 @@ from __future__ import annotations
 
 import pytest
 import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import nn
+from torchrl.data import Bounded, LazyTensorStorage, TensorDictPrioritizedReplayBuffer
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
 from loss_cases import (
     ACTION_DIM,
     NUM_STEPS,
@@ -13,12 +19,6 @@ from loss_cases import (
     set_constant,
     total,
 )
-from tensordict import TensorDict
-from tensordict.nn import TensorDictModule, TensorDictSequential
-from torch import nn
-from torchrl.data import Bounded, LazyTensorStorage, TensorDictPrioritizedReplayBuffer
-from torchrl.envs.utils import ExplorationType, set_exploration_type
-
 from torchrl_aca import (
     ACALoss,
     CriticGuidedDenoisingActor,
@@ -41,14 +41,6 @@ def test_each_loss_reaches_only_its_own_parameters(name):
     assert all((p.grad is None) is of_alpha for p in critic)
     assert of_alpha or all(p.grad.abs().sum() > 0 for p in critic)
     assert (loss.log_alpha.grad is not None) is of_alpha
-
-
-def test_the_summed_loss_reaches_every_parameter_and_no_target():
-    loss = make_loss()
-    total(loss(make_data(6))).backward()
-    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in loss.parameters())
-    targets = list(loss.target_qvalue_network_params.values(True, True))
-    assert targets and all(not p.requires_grad and p.grad is None for p in targets)
 
 
 # --- random draws ---------------------------------------------------------------------------------
@@ -81,27 +73,44 @@ def test_the_next_action_is_drawn_as_in_acting_whatever_the_exploration_type(mod
 
 def test_num_target_candidates_is_the_number_of_chains_of_the_target(monkeypatch):
     actor, data = make_actor(num_candidates=3), make_data(2)
-    seen, denoise = [], actor._denoise
+    guided, gradient = [], actor.critic.action_gradient
 
-    def spy(features, noise):
-        seen.append(noise.shape)
-        return denoise(features, noise)
+    def count(features, action, level):
+        guided.append((len(action), level.item()))
+        return gradient(features, action, level)
 
-    monkeypatch.setattr(actor, "_denoise", spy)
+    monkeypatch.setattr(actor.critic, "action_gradient", count)
     for given in (None, 1, 5):
         make_loss(actor, num_target_candidates=given)(data)
-    assert [shape[1] for shape in seen] == [3, 1, 5]
+    # From level 1 no gradient is asked for.
+    assert guided == [(chains, level) for chains in (3, 1, 5) for level in (4, 3, 2)]
 
 
 @pytest.mark.parametrize("first_level", [0, 1])
-def test_drawn_noise_levels_cover_exactly_the_noisy_levels(first_level, monkeypatch):
+def test_drawn_noise_levels_are_1_to_t_whatever_the_networks_indices(first_level, monkeypatch):
     loss = make_loss(make_actor(first_level=first_level))
-    seen, values = [], loss._values
+    seen, evaluate = [], loss.qvalue_network.evaluate
     monkeypatch.setattr(
-        loss, "_values", lambda obs, *queries: seen.append(queries[-1][1]) or values(obs, *queries)
+        loss.qvalue_network, "evaluate", lambda *args: seen.append(args[2]) or evaluate(*args)
     )
     loss.noise_level_loss(make_data(500))
-    assert seen[0].unique().tolist() == list(range(first_level, first_level + NUM_STEPS))
+    clean, noisy = seen
+    assert not clean.any()
+    assert noisy.unique().tolist() == list(range(1, NUM_STEPS + 1))
+
+
+def test_given_draws_may_be_looked_for_elsewhere_or_nowhere():
+    """Replay data may hold entries of these names that mean something else."""
+    data = make_data(6, draws=True)
+    free = data.exclude("noise", "noise_level", "next_action")
+    torch.manual_seed(1)
+    renamed, without = make_loss(), make_loss(use_given_draws=False)
+    renamed.set_keys(noise="z", noise_level="t", next_action=("agent", "next_action"))
+    for loss in (renamed, without):
+        torch.manual_seed(2)
+        expected = loss(free.clone())
+        torch.manual_seed(2)
+        torch.testing.assert_close(loss(data.clone()), expected, rtol=0, atol=0)
 
 
 def test_the_same_seed_gives_the_same_losses():
@@ -124,13 +133,12 @@ def test_the_same_seed_gives_the_same_losses():
 def test_noise_level_loss_by_hand(target, first_level):
     actor = make_actor(first_level=first_level)
     loss, data = make_loss(actor, noise_level_target=target), make_data(6, draws=True)
-    data["noise_level"] += first_level - 1
-    steps = data["noise_level"] - first_level + 1
-    signal = actor.schedule.alphas_cumprod[steps - 1].float().unsqueeze(-1)
+    level = data["noise_level"]
+    signal = actor.schedule.alphas_cumprod[level - 1].float().unsqueeze(-1)
     noisy = signal.sqrt() * data["action"] + (1 - signal).sqrt() * data["noise"]
     with torch.no_grad():
-        clean = actor.critic(data["observation"], data["action"], torch.zeros(6, dtype=torch.long))
-        value = actor.critic(data["observation"], noisy, data["noise_level"])
+        clean = actor.critic(data["observation"], data["action"], torch.zeros_like(level))
+        value = actor.critic(data["observation"], noisy, level)
     goal = clean if target == "self" else clean.mean(-1, keepdim=True)
     expected = (value - goal).square().sum(-1).mean()
     torch.testing.assert_close(loss.noise_level_loss(data)["loss_noise_level"], expected)
@@ -269,6 +277,65 @@ def test_td_error_is_the_largest_absolute_error_of_the_critics():
     loss.qvalue_loss(data)
     torch.testing.assert_close(data["td_error"], torch.tensor([2.0, 4.0]))
     assert not data["td_error"].requires_grad
+
+
+def test_an_update_reads_no_value_and_stays_on_its_device():
+    """As a CUDA graph asks: on the device `meta`, which has no values, both would raise."""
+    loss = ACALoss(make_actor().to("meta"))
+    optimizer = torch.optim.Adam(loss.qvalue_network.parameters())
+    data = make_data(4).to("meta")
+    data["next_action"] = loss.sample_next_action(data)
+    for losses in (loss.qvalue_loss(data), loss.noise_level_loss(data), loss.alpha_loss()):
+        sum(value for name, value in losses.items() if name.startswith("loss")).backward()
+    optimizer.step()
+    devices = {param.grad.device.type for param in loss.parameters() if param.requires_grad}
+    assert devices == {"meta"} == {data["td_error"].device.type}
+
+
+# --- arguments ------------------------------------------------------------------------------------
+
+
+def test_qvalue_network_must_be_the_critic_of_the_actor():
+    actor, other = make_actor(), make_actor()
+    assert ACALoss(actor, qvalue_network=actor.critic).qvalue_network is actor.critic
+    with pytest.raises(ValueError, match="must be actor_network.critic"):
+        ACALoss(actor, qvalue_network=other.critic)
+
+
+def test_qvalue_network_may_be_the_plain_module_that_the_actor_was_built_with():
+    class Net(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.net = nn.Linear(5, 2)
+
+        def forward(self, observation, action, noise_level):
+            return self.net(torch.cat([observation, action], -1))
+
+    module = TensorDictModule(
+        Net(), ["observation", "action", "noise_level"], ["state_action_value"]
+    )
+    actor = make_actor(module, action_dim=ACTION_DIM)
+    assert ACALoss(actor, qvalue_network=module).qvalue_network is actor.critic
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"noise_level_target": "max"}, "noise_level_target"),
+        ({"num_target_candidates": 0}, "num_target_candidates"),
+    ],
+)
+def test_bad_options_are_refused(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        ACALoss(make_actor(), **kwargs)
+
+
+def test_target_entropy_is_minus_nine_tenths_of_the_action_dim_unless_given():
+    assert make_loss().target_entropy.item() == pytest.approx(-0.9 * ACTION_DIM)
+    assert make_loss(target_entropy_scale=0.5).target_entropy.item() == pytest.approx(
+        -ACTION_DIM / 2
+    )
+    assert make_loss(target_entropy=-3.0).target_entropy.item() == -3.0
 
 
 # --- learning -------------------------------------------------------------------------------------

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import oracle
 import pytest
 import torch
+
+import oracle
 from reference import OfficialAgent, assert_within
 
 OBS, ACT, STEPS, CANDIDATES, BATCH = 3, 2, 5, 3, 7

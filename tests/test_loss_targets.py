@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import pytest
 import torch
-from loss_cases import make_data, make_loss, set_constant, total
 from torchrl.data.postprocs import MultiStep
 from torchrl.objectives import ValueEstimators
 from torchrl.objectives.value import TD0Estimator, TDLambdaEstimator
+
+from loss_cases import make_data, make_loss, set_constant, total
 
 SUPPORTED = (ValueEstimators.TD0, ValueEstimators.TD1, ValueEstimators.TDLambda)
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import importlib
-import itertools
 import json
 import os
 import shutil
 import signal
+import time
 from pathlib import Path
 
 import numpy as np
@@ -15,16 +14,19 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
-from recipe_cases import CONFIGS, RECIPES, composed, rows_of, run
 
-from torchrl_aca.offline import DatasetError, OfflineDataset
+from agents import load_policy, without_methods
+from data.generate import GeneratorConfig, make_dataset
+from recipe_cases import CONFIGS, rows_of, run, start
+from torchrl_aca.errors import DatasetError, RunError
+from torchrl_aca.offline import OfflineDataset
 from torchrl_aca.training.checkpoint import read_checkpoint
-from torchrl_aca.training.envs import make_env, make_vector_env
-from torchrl_aca.errors import RunError
+from torchrl_aca.training.config import checked
+from torchrl_aca.training.envs import make_env
 
 SAC = [
     "sac.num_cells=[16,16]",
-    "collector.init_random_frames=100",
+    "collector.warmup_frames=100",
     "optim.batch_size=16",
     "optim.total_updates=40",
     "eval.interval=20",
@@ -55,25 +57,16 @@ def configured(tier: str, cwd: Path, *overrides: str, sac: list[str] = SAC) -> l
     ]
 
 
-@pytest.fixture(scope="module")
-def recipes():
-    """The recipes' modules, by name."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(RECIPES))
-        yield importlib.import_module
+def made(*overrides: str) -> OfflineDataset:
+    """The generator without a process of its own; only a SAC run has one."""
+    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+        cfg = without_methods(compose("make_dataset", overrides), GeneratorConfig.model_fields)
+        return make_dataset(checked(GeneratorConfig, cfg))
 
 
-@pytest.fixture(scope="module")
-def generate(recipes):
-    """The generator, for what needs no process of its own."""
-
-    def generator(tier: str, cwd: Path, *overrides: str, sac: list[str] = SAC) -> OfflineDataset:
-        typed = configured(tier, cwd, *overrides, sac=sac)
-        with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-            dataset = recipes("make_dataset").make_dataset(compose("make_dataset", typed))
-        return OfflineDataset.load(dataset.path, verify=True)
-
-    return generator
+def generate(tier: str, cwd: Path, *overrides: str, sac: list[str] = SAC) -> OfflineDataset:
+    dataset = made(*configured(tier, cwd, *overrides, sac=sac))
+    return OfflineDataset.load(dataset.path, verify=True)
 
 
 def columns(dataset: OfflineDataset) -> dict[str, torch.Tensor]:
@@ -81,7 +74,7 @@ def columns(dataset: OfflineDataset) -> dict[str, torch.Tensor]:
 
 
 @pytest.fixture(scope="module")
-def folder(generate, tmp_path_factory) -> Path:
+def folder(tmp_path_factory) -> Path:
     """Where both tiers of one SAC run were generated."""
     cwd = tmp_path_factory.mktemp("generated")
     generate("medium_replay", cwd)
@@ -113,7 +106,7 @@ def test_random_halfcheetah_has_the_returns_that_d4rl_found(tmp_path):
     assert not dataset.data["next", "terminated"].any()
 
 
-def test_metadata_say_where_the_data_come_from(generate, tmp_path):
+def test_metadata_say_where_the_data_come_from(tmp_path):
     metadata = generate("random", tmp_path).metadata
     assert metadata["name"] == "hopper random (D4RL-style, locally generated)"
     assert (metadata["env_id"], metadata["episodes"]) == ("Hopper-v4", 5)
@@ -124,7 +117,7 @@ def test_metadata_say_where_the_data_come_from(generate, tmp_path):
     assert (tmp_path / "random" / "returns.png").stat().st_size > 1000
 
 
-def test_the_same_seed_gives_the_same_data(generate, tmp_path):
+def test_the_same_seed_gives_the_same_data(tmp_path):
     sums = [
         generate("random", tmp_path / name, f"seed={seed}").metadata["sha256"]
         for name, seed in (("first", 3), ("second", 3), ("third", 4))
@@ -139,7 +132,7 @@ def test_medium_replay_is_the_buffer_of_the_run_row_by_row(folder):
     dataset = OfflineDataset.load(folder / "medium_replay")
     parts = read_checkpoint(folder / "sac")["parts"]
     rows = parts["buffer"]["rows"]
-    assert len(dataset.data) == parts["counters"]["frames"] == 140
+    assert len(dataset.data) == parts["collection"]["frames"] == 140
     done = rows["next.done"].flatten()
     for key in KEYS:
         expected = rows[key].clone()
@@ -153,15 +146,12 @@ def test_medium_replay_is_the_buffer_of_the_run_row_by_row(folder):
     assert [row["updates"] for row in history] == [0, 20, 40]
 
 
-def test_medium_samples_the_policy_that_the_run_ended_with(folder, recipes):
+def test_medium_samples_the_policy_that_the_run_ended_with(folder):
     dataset = OfflineDataset.load(folder / "medium")
     run_dir = folder / "sac"
-    cfg = OmegaConf.load(run_dir / "config.yaml")
-    env = make_vector_env("Hopper-v4", 1, 0)
-    agent = recipes("agents").AGENTS["sac"](cfg, env, torch.device("cpu"))
-    agent.state["loss"].load_state_dict(read_checkpoint(run_dir)["parts"]["agent.loss"])
+    policy, _ = load_policy(run_dir)
     with torch.no_grad():
-        dist = agent.policy.get_dist(dataset.data.select("observation"))
+        dist = policy.get_dist(dataset.data.select("observation"))
     loc, scale = dist.base_dist.base_dist.loc, dist.base_dist.base_dist.scale
     action = dataset.data["action"]
     inside = action.abs() < 0.9999  # further out, float32 forgets how far it was
@@ -176,7 +166,7 @@ def test_medium_samples_the_policy_that_the_run_ended_with(folder, recipes):
         np.testing.assert_array_equal(dataset.data["observation"][row], expected)
 
 
-def test_a_finished_run_is_used_again_and_one_of_another_seed_is_refused(generate, folder):
+def test_a_finished_run_is_used_again_and_one_of_another_seed_is_refused(folder):
     trained = (folder / "sac" / "metrics.csv").stat().st_mtime_ns
     again = generate("medium", folder, f"path={folder / 'again'}")
     assert (folder / "sac" / "metrics.csv").stat().st_mtime_ns == trained
@@ -188,12 +178,12 @@ def test_a_finished_run_is_used_again_and_one_of_another_seed_is_refused(generat
         generate("medium", folder, f"path={folder / 'other'}", sac=fewer)
 
 
-def test_a_mistyped_override_of_the_run_is_told_in_one_message(generate, tmp_path):
+def test_a_mistyped_override_of_the_run_is_told_in_one_message(tmp_path):
     with pytest.raises(RunError, match="^sac.overrides: .*optim.update"):
         generate("medium", tmp_path, sac=[*SAC, "optim.updates=5"])
 
 
-def test_the_run_stops_when_two_evaluations_have_averaged_the_return(generate, tmp_path):
+def test_the_run_stops_when_two_evaluations_have_averaged_the_return(tmp_path):
     dataset = generate("medium_replay", tmp_path, sac=[*SAC, "eval.stop_return=-1000"])
     evaluated = rows_of(tmp_path / "sac" / "eval.csv")
     assert [row["updates"] for row in evaluated] == ["0", "20"]
@@ -203,34 +193,31 @@ def test_the_run_stops_when_two_evaluations_have_averaged_the_return(generate, t
     assert [row["updates"] for row in evaluated] == ["0", "20", "40"]
 
 
-def test_an_interrupted_run_goes_on_with_the_same_command(generate, folder, recipes, tmp_path):
-    agents = recipes("agents").AGENTS
-    make_sac = agents["sac"]
-
-    def interrupted_sac(cfg, env, device):
-        agent = make_sac(cfg, env, device)
-        update, done = agent.update, itertools.count(1)
-
-        def update_and_interrupt(batch):
-            if next(done) == 25:
-                os.kill(os.getpid(), signal.SIGINT)
-            return update(batch)
-
-        agent.update = update_and_interrupt
-        return agent
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(agents, "sac", interrupted_sac)
-        with pytest.raises(RunError, match="was stopped before its end"):
-            generate("medium_replay", tmp_path)
+def test_an_interrupted_run_goes_on_with_the_same_command(tmp_path):
+    typed = configured("medium_replay", tmp_path, sac=[*SAC, "optim.total_updates=200000"])
+    process = start(*typed, cwd=tmp_path, recipe="make_dataset")
+    deadline = time.monotonic() + 100
+    while not table_has_rows(tmp_path / "sac" / "metrics.csv"):
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.1)
+    os.kill(process.pid, signal.SIGINT)
+    output, errors = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert errors.endswith("stopped before its end, so no data set was made. The same command "
+                           "goes on with it.\n")  # fmt: skip
     assert not (tmp_path / "medium_replay").exists()
-    assert read_checkpoint(tmp_path / "sac")["parts"]["counters"]["updates"] == 25
-    resumed = generate("medium_replay", tmp_path)
-    whole = OfflineDataset.load(folder / "medium_replay")
-    assert resumed.metadata["sha256"] == whole.metadata["sha256"]
+    stopped = read_checkpoint(tmp_path / "sac")["parts"]["counters"]["updates"]
+    assert 10 <= stopped < 200_000
+    shorter = [*SAC, f"optim.total_updates={stopped + 5}"]
+    resumed = generate("medium_replay", tmp_path, sac=shorter)
+    assert len(resumed.data) == 100 + stopped + 5
 
 
-def test_a_run_that_was_killed_after_its_last_evaluation_goes_on(generate, folder, tmp_path):
+def table_has_rows(path: Path) -> bool:
+    return path.is_file() and len(rows_of(path)) > 0
+
+
+def test_a_run_that_was_killed_after_its_last_evaluation_goes_on(folder, tmp_path):
     shutil.copytree(folder / "sac", tmp_path / "sac")
     generate("medium_replay", tmp_path, sac=[*SAC, "optim.total_updates=60"])
     (newest,) = (tmp_path / "sac" / "checkpoints").glob("*0060.pt")
@@ -241,14 +228,22 @@ def test_a_run_that_was_killed_after_its_last_evaluation_goes_on(generate, folde
     assert newest.exists() and again.metadata["episodes"] == 5
 
 
-def test_a_run_that_was_killed_without_a_checkpoint_is_named(generate, tmp_path):
-    (tmp_path / "sac").mkdir()
-    (tmp_path / "sac" / "config.yaml").write_text("{}")
-    with pytest.raises(RunError, match="without a checkpoint: .*at work.*delete"):
-        generate("medium", tmp_path)
+def test_a_run_that_was_killed_before_its_first_checkpoint_starts_anew(folder, tmp_path):
+    shutil.copytree(folder / "sac", tmp_path / "sac")
+    shutil.rmtree(tmp_path / "sac" / "checkpoints")
+    dataset = generate("medium_replay", tmp_path)
+    whole = OfflineDataset.load(folder / "medium_replay")
+    assert dataset.metadata["sha256"] == whole.metadata["sha256"]
 
 
-def test_a_buffer_that_forgets_is_refused(generate, tmp_path):
+def test_a_run_that_fails_is_told_and_leaves_no_data(tmp_path, capfd):
+    with pytest.raises(RunError, match="the SAC run ended with status 1; see its message above"):
+        generate("medium", tmp_path, sac=[*SAC, "optim.lr=abc"])
+    assert "error: optim.lr='abc': expected a valid number" in capfd.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_buffer_that_forgets_is_refused(tmp_path):
     with pytest.raises(RunError, match="120 of its 140 frames"):
         generate("medium_replay", tmp_path, sac=[*SAC, "buffer.capacity=120"])
     assert {path.name for path in tmp_path.iterdir()} == {"sac"}
@@ -260,31 +255,46 @@ def test_a_buffer_that_forgets_is_refused(generate, tmp_path):
 @pytest.mark.parametrize(
     ("overrides", "error", "message"),
     [
-        (["tier=expert"], RunError, "tier=expert: expected one of.*'medium_replay'"),
-        ([], RunError, "tier=None: expected one of"),
-        (["tier=random", "episodes=0"], RunError, "episodes=0: expected an integer of at least 1"),
-        (["tier=random", "seed=-1"], RunError, "seed=-1: expected an integer of at least 0"),
+        (["tier=expert"], RunError, "tier='expert': expected 'random', 'medium' or 'medium_rep"),
+        ([], RunError, "tier=.*: expected a value. Set it with tier="),
+        (
+            ["tier=random", "episodes=0"],
+            RunError,
+            "episodes=0: expected greater than or",
+        ),
+        (["tier=random", "episodes=abc"], RunError, "episodes='abc': expected a valid integer"),
+        (["tier=random", "seed=-1"], RunError, "seed=-1: expected greater than or equal to 0"),
+        (["tier=random", "seed=1.5"], RunError, "seed=1.5: expected a valid integer"),
+        (["tier=random", "check=abc"], RunError, "check='abc': expected a valid boolean"),
+        (["tier=random", "sac=null"], RunError, "sac=None: expected a section"),
+        (["tier=random", "sac.overrides=x"], RunError, "sac.overrides='x': expected a valid list"),
+        (["tier=random", "+speed=3"], RunError, "speed=3: there is no such key"),
+        (
+            ["tier=random", "+bands={{Hopper-v4:{{random:{{men:[1,2]}}}}}}"],
+            RunError,
+            "bands.Hopper-v4.random.men='men': expected 'mean', 'std', 'min' or 'max'",
+        ),
         (["tier=random", "env.name=Nowhere-v0"], RunError, "Nowhere-v0.*cannot be made"),
         (["tier=random", "path={0}"], DatasetError, "exists already"),
         (
             ["tier=random", "+bands={{Hopper-v4:{{random:{{mean:[1000,null]}}}}}}"],
             DatasetError,
-            r"the mean of the 5 returns is .*; expected 1000 to None",
+            r"the mean of the 5 returns is .*; expected 1000.0 to None",
         ),
     ],
 )
-def test_mistakes_leave_nothing(recipes, tmp_path, overrides, error, message):
+def test_mistakes_leave_nothing(tmp_path, overrides, error, message):
     tiny = ["env=hopper", "episodes=5", f"path={tmp_path / 'here'}"]
     overrides = [override.format(tmp_path) for override in overrides]
     with pytest.raises(error, match=message):
-        recipes("make_dataset").make_dataset(composed(*tiny, *overrides, name="make_dataset"))
+        made(*tiny, *overrides)
     assert not list(tmp_path.iterdir())
 
 
-def test_check_false_takes_what_the_bands_refuse(recipes, tmp_path):
+def test_check_false_takes_what_the_bands_refuse(tmp_path):
     bands = "+bands={Hopper-v4:{random:{mean:[1000,null]}}}"
     tiny = ["tier=random", "env=hopper", "episodes=2", f"path={tmp_path / 'here'}", "check=false"]
-    dataset = recipes("make_dataset").make_dataset(composed(*tiny, bands, name="make_dataset"))
+    dataset = made(*tiny, bands)
     assert dataset.metadata["returns"]["mean"] < 1000
 
 
@@ -301,6 +311,11 @@ def test_bands_contain_what_d4rl_published():
         for name, (low, high) in bands[tier].items():
             assert low is None or low <= values[name]
             assert high is None or values[name] <= high
+
+
+def test_a_mistake_ends_the_command_in_one_message(tmp_path):
+    code, _, errors = run("tier=expert", cwd=tmp_path, recipe="make_dataset")
+    assert code == 1 and errors.startswith("error: tier='expert'") and errors.count("\n") == 1
 
 
 def test_metadata_are_json_that_others_can_read(folder):

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from offline_cases import ACTION_DIM, OBSERVATION_DIM, episode, joined, write
 from tensordict import TensorDict
 from torchrl.data import OfflineToOnlineReplayBuffer
 from torchrl.data.datasets import load_dataset
 
+from offline_cases import ACTION_DIM, OBSERVATION_DIM, episode, joined, write
 from torchrl_aca.offline import (
     DatasetError,
     DatasetWriter,

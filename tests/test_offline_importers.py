@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-import importlib
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_dir
-from offline_cases import ACTION_DIM, OBSERVATION_DIM, episode, joined
 
+from data.describe import summary
+from import_dataset import import_dataset
+from offline_cases import ACTION_DIM, OBSERVATION_DIM, episode, joined
+from recipe_cases import composed
+from torchrl_aca.errors import RunError
 from torchrl_aca.offline import (
     DatasetError,
     DatasetWriter,
@@ -25,7 +28,6 @@ h5py = pytest.importorskip("h5py")
 minari = pytest.importorskip("minari")
 spaces = pytest.importorskip("gymnasium").spaces
 
-RECIPES = Path(__file__).parents[1] / "recipes"
 # Ends by the time limit, by a terminal, by the time limit after one step, and by the file's end.
 EPISODES = [episode(4), episode(5, "terminated"), episode(1), episode(3, "none")]
 NAMES = {
@@ -389,22 +391,15 @@ def test_minari_data_that_are_damaged_or_not_there_are_refused(tmp_path, monkeyp
 # --- the recipe -----------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def recipe(monkeypatch):
-    monkeypatch.syspath_prepend(str(RECIPES))
-    return importlib.import_module("import_dataset")
+def imported(*overrides: str) -> OfflineDataset:
+    return import_dataset(composed(*overrides, name="import_dataset"))
 
 
-def configured(*overrides: str):
-    with initialize_config_dir(str(RECIPES / "configs"), version_base="1.3"):
-        return compose("import_dataset", overrides=list(overrides))
-
-
-def test_recipe_imports_and_sums_up(recipe, source, tmp_path):
+def test_recipe_imports_and_sums_up(source, tmp_path):
     overrides = [f"source={source}", f"path={tmp_path / 'data'}", "format=d4rl", "name=mine"]
-    dataset = recipe.import_dataset(configured(*overrides, "env_id=HalfCheetah-v2"))
+    dataset = imported(*overrides, "env_id=HalfCheetah-v2")
     assert dataset.metadata["name"] == "mine"
-    lines = recipe.summary(dataset).splitlines()
+    lines = summary(dataset).splitlines()
     assert lines[0].endswith("13 transitions in 4 episodes")
     mean = np.mean([each["reward"].sum() for each in EPISODES[:3]])
     assert lines[1].startswith(f"returns: mean {mean:.1f}")
@@ -412,18 +407,28 @@ def test_recipe_imports_and_sums_up(recipe, source, tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
-def test_recipe_takes_the_bounds_of_minari(recipe, tmp_path, monkeypatch):
+def test_recipe_takes_the_bounds_of_minari(tmp_path, monkeypatch):
     directory = make_minari(tmp_path / "minari", monkeypatch)
-    dataset = recipe.import_dataset(
-        configured(f"source={directory}", f"path={tmp_path / 'data'}", "format=minari")
-    )
+    dataset = imported(f"source={directory}", f"path={tmp_path / 'data'}", "format=minari")
     assert dataset.metadata["action_bounds"] == {"low": [-2, -2], "high": [3, 3]}
 
 
-def test_recipe_names_what_is_missing(recipe, source):
-    with pytest.raises(DatasetError, match=r"values for \['format', 'path'\]"):
-        recipe.import_dataset(configured(f"source={source}"))
-    with pytest.raises(DatasetError, match=r"values for \['path'\]"):
-        recipe.import_dataset(configured(f"source={source}", "path=null", "format=d4rl"))
-    with pytest.raises(DatasetError, match="format=csv: expected one of"):
-        recipe.import_dataset(configured(f"source={source}", "path=x", "format=csv"))
+def test_a_number_may_be_a_name():
+    with pytest.raises(DatasetError, match="^2024 does not exist"):
+        imported("source=2024", "format=d4rl", "path=5")
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["source=x"], "format=???: expected a value"),
+        (["source=x", "path=null", "format=d4rl"], "path=None: expected a valid string"),
+        (["source=x", "path=y", "format=csv"], "format='csv': expected 'd4rl' or 'minari'"),
+        (["source=x", "path=y", "format=d4rl", "check_continuity=5"], "expected a valid boolean"),
+        (["source=x", "path=y", "format=d4rl", "allow_constant=[a]"], "allow_constant.0='a': exp"),
+        (["source=x", "path=y", "format=d4rl", "+speed=3"], "speed=3: there is no such key"),
+    ],
+)
+def test_recipe_names_each_mistake(overrides, message):
+    with pytest.raises(RunError, match=re.escape(message)):
+        imported(*overrides)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import oracle
 import pytest
+
+import oracle
 
 OBS, ACTION, BATCH, T = 4, 3, 6, 20
 

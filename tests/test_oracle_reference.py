@@ -1,14 +1,15 @@
 """The oracle against numbers recorded from the official implementation (float32, on a CPU).
 
-The recording is no part of a clone: ``TORCHRL_ACA_REFERENCE`` names it. The tolerances tell the
+``data/README.md`` describes the recording, whose indices are the oracle's. The tolerances tell the
 readings of the algorithm apart: the closest wrong one found, targets that follow the critics before
 instead of after the noise-level step, is off by 1e-5 in the target parameters and nowhere else.
 """
 
 from __future__ import annotations
 
-import oracle
 import pytest
+
+import oracle
 from reference import CRITICS, TARGETS, assert_within, load_recording, subtree
 
 # Worst absolute errors allowed; in brackets those found.

@@ -1,9 +1,9 @@
 from __future__ import annotations
 
-import oracle
 import pytest
 import torch
 
+import oracle
 from torchrl_aca import NoiseLevelCritic, NoiseSchedule
 
 T, MEAN, STD, BEST = 5, 0.3, 0.5, -0.2

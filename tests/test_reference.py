@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+
 from reference import CRITICS, TARGETS, OfficialAgent, assert_within, load_recording, subtree
 
 VALUE = 1e-6
@@ -49,7 +50,8 @@ def test_schedule(recording, agent):
 
 def test_critic_values(recording, agent):
     data = subtree(recording, "critic")
-    inputs = agent.tensor(data["obs"]), agent.tensor(data["action"]), torch.as_tensor(data["t"])
+    level = torch.as_tensor(data["t"]) + 1  # the official indices are 0..T-1
+    inputs = agent.tensor(data["obs"]), agent.tensor(data["action"]), level
     values = agent.critic(*inputs).detach().numpy()
     for c, name in enumerate(CRITICS):
         assert_within(values[:, c], data[name], VALUE, name)

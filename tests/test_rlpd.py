@@ -1,24 +1,28 @@
-"""RLPD's loss against a float64 restatement in NumPy, and what TorchRL asks of a loss module."""
+"""RLPD's loss against a float64 restatement in NumPy, and its ensemble of critics."""
 
 from __future__ import annotations
 
-import copy
 from itertools import combinations, combinations_with_replacement
 
 import numpy as np
 import pytest
 import torch
-from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
-from torch import nn
-from torchrl.data import Bounded
-from torchrl.modules import MLP, NormalParamExtractor, ProbabilisticActor, TanhNormal, ValueOperator
-from torchrl.objectives import SoftUpdate, ValueEstimators
+from torchrl.modules import MLP, ValueOperator
+from torchrl.objectives import ValueEstimators
 
+from loss_cases import (
+    ACTION_DIM,
+    HIGH,
+    LOW,
+    OBSERVATION_DIM,
+    make_policy,
+    make_rlpd,
+    make_rlpd_data,
+)
 from torchrl_aca.baselines import EnsembleMLP, EnsembleSACLoss
 
-OBS, ACT, MEMBERS, BATCH, GAMMA = 3, 2, 4, 40, 0.875
-LOW, HIGH = np.array([-2.0, -1.0]), np.array([1.0, 3.0])
+OBS, ACT, MEMBERS, BATCH, GAMMA = OBSERVATION_DIM, ACTION_DIM, 4, 40, 0.875
+LOW, HIGH = LOW.numpy(), HIGH.numpy()
 EXACT = {"rel": 1e-8, "abs": 1e-10}
 WSRL = {
     "subset_with_replacement": True,
@@ -28,59 +32,6 @@ WSRL = {
     "temperature": "softplus",
 }
 VARIANTS = {"rlpd": {}, "wsrl": WSRL}
-LOSSES = {"loss_qvalue", "loss_actor", "loss_alpha"}
-METRICS = {"pred_value", "target_value", "entropy", "alpha"}
-
-
-def make_actor(spec=True):
-    low, high = torch.tensor(LOW), torch.tensor(HIGH)
-    network = nn.Sequential(
-        MLP(OBS, 2 * ACT, num_cells=[8], activation_class=nn.ReLU).double(),
-        NormalParamExtractor(scale_mapping="exp"),
-    )
-    return ProbabilisticActor(
-        TensorDictModule(network, in_keys=["observation"], out_keys=["loc", "scale"]),
-        in_keys=["loc", "scale"],
-        spec=Bounded(low, high, (ACT,), dtype=torch.float64) if spec else None,
-        distribution_class=TanhNormal,
-        distribution_kwargs={"low": low, "high": high},
-    )
-
-
-def make_loss(actor=None, num_members=MEMBERS, **kwargs):
-    """A loss with no parameter at a special value, and targets that differ from the critics."""
-    network = EnsembleMLP(OBS + ACT, num_members, num_cells=(6, 5), dtype=torch.float64)
-    critics = ValueOperator(network, in_keys=["observation", "action"])
-    loss = EnsembleSACLoss(actor or make_actor(), critics, **kwargs)
-    loss.make_value_estimator(gamma=GAMMA)
-    SoftUpdate(loss, tau=0.1)
-    for params in (loss.qvalue_network_params, loss.target_qvalue_network_params):
-        for param in params.values(True, True):
-            param.data.add_(0.3 * torch.randn_like(param))
-        # Members apart from row to row rather than everywhere: so each is the smallest somewhere.
-        last = params["module", "layers", "6"]
-        last["bias"].data.zero_()
-        last["weight"].data.sub_(last["weight"].data.mean(1, keepdim=True))
-    loss.raw_alpha.data.fill_(0.3)
-    return loss
-
-
-def make_data(*batch):
-    terminated = torch.zeros(*batch, 1, dtype=torch.bool)
-    terminated.view(-1)[::3] = True
-    following = {
-        "observation": torch.randn(*batch, OBS, dtype=torch.float64),
-        "reward": torch.randn(*batch, 1, dtype=torch.float64),
-        "done": torch.ones_like(terminated),  # time limits, which must not stop the bootstrap
-        "terminated": terminated,
-    }
-    unit = torch.rand(*batch, ACT, dtype=torch.float64)
-    return TensorDict(
-        observation=torch.randn(*batch, OBS, dtype=torch.float64),
-        action=torch.tensor(LOW) + unit * torch.tensor(HIGH - LOW),
-        next=TensorDict(following, batch_size=batch),
-        batch_size=batch,
-    )
 
 
 class Oracle:
@@ -194,7 +145,7 @@ def assert_slope(loss, value, oracle, function, owns):
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_qvalue_loss_and_gradient_equal_the_oracle(variant):
-    loss, data = make_loss(**VARIANTS[variant]), make_data(BATCH)
+    loss, data = make_rlpd(**VARIANTS[variant]), make_rlpd_data(BATCH)
     oracle, noise = Oracle(loss, data, variant), noise_of(5)
     value = seeded(loss.qvalue_loss, data)["loss_qvalue"]
     subsets = combinations_with_replacement(range(MEMBERS), 2)
@@ -206,7 +157,7 @@ def test_qvalue_loss_and_gradient_equal_the_oracle(variant):
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_actor_loss_and_gradient_equal_the_oracle(variant):
-    loss, data = make_loss(**VARIANTS[variant]), make_data(BATCH)
+    loss, data = make_rlpd(**VARIANTS[variant]), make_rlpd_data(BATCH)
     oracle, noise = Oracle(loss, data, variant), noise_of(5)
     value = seeded(loss.actor_loss, data)["loss_actor"]
     assert value.item() == pytest.approx(oracle.actor_loss(noise), **EXACT)
@@ -216,7 +167,7 @@ def test_actor_loss_and_gradient_equal_the_oracle(variant):
 @pytest.mark.parametrize("after_actor", [True, False])
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_alpha_loss_and_gradient_equal_the_oracle(variant, after_actor):
-    loss, data = make_loss(**VARIANTS[variant]), make_data(BATCH)
+    loss, data = make_rlpd(**VARIANTS[variant]), make_rlpd_data(BATCH)
     oracle, noise = Oracle(loss, data, variant), noise_of(5)
     if after_actor:  # whose draws are used again, whatever the generator would give now
         seeded(loss.actor_loss, data)
@@ -234,7 +185,7 @@ def test_alpha_loss_and_gradient_equal_the_oracle(variant, after_actor):
     [("rlpd", combinations), ("wsrl", combinations_with_replacement)],
 )
 def test_every_subset_is_drawn_and_only_with_replacement_a_member_twice(variant, allowed):
-    loss, data = make_loss(**VARIANTS[variant]), make_data(BATCH)
+    loss, data = make_rlpd(**VARIANTS[variant]), make_rlpd_data(BATCH)
     oracle, drawn = Oracle(loss, data, variant), set()
     subsets = list(combinations_with_replacement(range(MEMBERS), 2))
     for seed in range(60):
@@ -246,14 +197,14 @@ def test_every_subset_is_drawn_and_only_with_replacement_a_member_twice(variant,
 
 
 def test_what_follows_a_terminal_state_counts_for_nothing():
-    loss, data = make_loss(), make_data(BATCH)
+    loss, data = make_rlpd(), make_rlpd_data(BATCH)
     expected = seeded(loss.qvalue_loss, data)
     data["next", "observation"][data["next", "terminated"][:, 0]] = float("nan")
     torch.testing.assert_close(seeded(loss.qvalue_loss, data), expected)
 
 
 def test_returns_over_several_steps_are_discounted_over_these():
-    loss, data = make_loss(), make_data(BATCH)
+    loss, data = make_rlpd(), make_rlpd_data(BATCH)
     data["next", "reward"].zero_()
     one = seeded(loss.qvalue_loss, data)["target_value"]
     data["steps_to_next_obs"] = torch.full((BATCH, 1), 3)
@@ -262,29 +213,29 @@ def test_returns_over_several_steps_are_discounted_over_these():
 
 
 def test_metrics_are_those_of_the_losses():
-    loss, data = make_loss(), make_data(BATCH)
+    loss, data = make_rlpd(), make_rlpd_data(BATCH)
     out = seeded(loss.actor_loss, data)
     assert out["entropy"] == pytest.approx(-data["policy_log_prob"].mean().item())
     assert data["policy_log_prob"].shape == (BATCH,) and not data["policy_log_prob"].requires_grad
-    values = loss._values(loss.qvalue_network_params, data, data["action"])
+    values = loss.qvalue_network(data.clone())["state_action_value"]
     assert loss.qvalue_loss(data)["pred_value"] == pytest.approx(values.mean().item())
 
 
 def test_alpha_starts_where_it_was_told():
     for kind in ("exp", "softplus"):
         loss = EnsembleSACLoss(
-            make_actor(), make_loss().qvalue_network, temperature=kind, alpha_init=0.7
+            make_policy(), make_rlpd().qvalue_network, temperature=kind, alpha_init=0.7
         )
         assert loss.alpha.item() == pytest.approx(0.7)
 
 
 def test_target_entropy_is_a_number_or_a_share_of_the_action_size():
-    assert make_loss().target_entropy.item() == -0.5 * ACT
-    assert make_loss(target_entropy_scale=1.0).target_entropy.item() == -ACT
-    assert make_loss(target_entropy=-0.3).target_entropy.item() == pytest.approx(-0.3)
-    assert make_loss(make_actor(spec=False), target_entropy=-0.3).target_entropy < 0
+    assert make_rlpd().target_entropy.item() == -0.5 * ACT
+    assert make_rlpd(target_entropy_scale=1.0).target_entropy.item() == -ACT
+    assert make_rlpd(target_entropy=-0.3).target_entropy.item() == pytest.approx(-0.3)
+    assert make_rlpd(policy=make_policy(spec=False), target_entropy=-0.3).target_entropy < 0
     with pytest.raises(ValueError, match='target_entropy="auto" needs the size of the action'):
-        make_loss(make_actor(spec=False))
+        make_rlpd(policy=make_policy(spec=False))
 
 
 # --- the ensemble ---------------------------------------------------------------------------------
@@ -323,113 +274,24 @@ def test_empty_ensembles_are_refused(sizes):
         EnsembleMLP(num_in, members, num_cells=num_cells)
 
 
-# --- the LossModule contract ----------------------------------------------------------------------
-
-
-def test_forward_gives_all_losses_and_leaves_every_given_value_as_it_was():
-    loss, data = make_loss(), make_data(BATCH)
-    before = data.clone()
-    whole = seeded(loss, data)
-    assert set(data.keys(True, True)) - set(before.keys(True, True)) == {"policy_log_prob"}
-    assert (data.select(*before.keys(True, True)) == before).all()
-    assert set(whole.keys()) == set(loss.out_keys) == LOSSES | METRICS
-    assert not any(whole[key].requires_grad for key in METRICS)
-    torch.manual_seed(5)
-    parts = loss.qvalue_loss(data).update(loss.actor_loss(data)).update(loss.alpha_loss(data))
-    torch.testing.assert_close(parts, whole, rtol=0, atol=0)
-
-
-@pytest.mark.parametrize("new", ["other", ("deep", "other")], ids=["flat", "nested"])
-@pytest.mark.parametrize("key", ["action", "value", "log_prob", "reward", "done", "terminated"])
-def test_set_keys_renames_what_is_read_and_written(key, new):
-    loss, data = make_loss(), make_data(BATCH)
-    expected = seeded(loss, data.clone())
-    old, renamed = getattr(loss.tensor_keys, key), data.clone()
-    loss.set_keys(**{key: new})
-    below = new if isinstance(new, tuple) else (new,)
-    if key in ("reward", "done", "terminated"):
-        renamed.rename_key_(("next", old), ("next", *below))
-        assert ("next", *below) in loss.in_keys
-    elif key == "action":
-        renamed.rename_key_(old, new)
-    torch.testing.assert_close(seeded(loss, renamed), expected, rtol=0, atol=0)
-    if key == "log_prob":
-        assert renamed[new].shape == (BATCH,)
-
-
-def test_keyword_arguments_give_what_a_tensordict_gives():
-    loss, data = make_loss(), make_data(BATCH)
-    expected = seeded(loss, data)
-    torch.manual_seed(5)
-    values = loss(**{k if isinstance(k, str) else "_".join(k): data[k] for k in loss.in_keys})
-    for key, value in zip(loss.out_keys, values, strict=True):
-        torch.testing.assert_close(value, expected[key], rtol=0, atol=0)
-
-
-@pytest.mark.parametrize("key", make_loss().in_keys, ids=str)
-def test_a_missing_entry_is_named(key):
-    with pytest.raises(KeyError, match=key if isinstance(key, str) else key[-1]):
-        make_loss()(make_data(2).exclude(key))
-
-
-@pytest.mark.parametrize("batch", [(6,), (2, 3)])
-def test_reductions_agree_with_one_another(batch):
-    loss, data, out = make_loss(), make_data(*batch), {}
-    for reduction in ("none", "mean", "sum"):
-        loss.reduction, loss.out_keys = reduction, None
-        out[reduction] = seeded(loss, data.clone())
-    assert out["none"].batch_size == batch and set(out["none"].keys()) == LOSSES
-    for key in LOSSES:
-        assert out["none"][key].shape == batch
-        torch.testing.assert_close(out["none"][key].mean(), out["mean"][key])
-        torch.testing.assert_close(out["none"][key].sum(), out["sum"][key])
+# --- arguments ------------------------------------------------------------------------------------
 
 
 def test_only_one_step_returns_are_offered():
     with pytest.raises(NotImplementedError, match="TDLambda|TD_LAMBDA|not supported"):
-        make_loss().make_value_estimator(ValueEstimators.TDLambda)
-
-
-@pytest.mark.slow
-def test_compiled_losses_equal_eager_ones():
-    loss, data = make_loss(), make_data(BATCH)
-    results = []
-    for wrap in (lambda f: f, lambda f: torch.compile(f, fullgraph=True, backend="aot_eager")):
-        loss.zero_grad(set_to_none=True)
-        batch = data.clone()
-        out = seeded(wrap(loss.qvalue_loss), batch)
-        out = out.update(seeded(wrap(loss.actor_loss), batch)).update(loss.alpha_loss(batch))
-        sum(out[key] for key in LOSSES).backward()
-        results.append((out, [param.grad.clone() for param in loss.parameters()]))
-    torch.testing.assert_close(*results)
-
-
-def test_a_state_dict_carries_the_loss_over():
-    loss, other, data = make_loss(), make_loss(), make_data(BATCH)
-    expected = seeded(loss, data.clone())
-    assert not torch.equal(seeded(other, data.clone())["loss_qvalue"], expected["loss_qvalue"])
-    other.load_state_dict(loss.state_dict())
-    torch.testing.assert_close(seeded(other, data.clone()), expected, rtol=0, atol=0)
-
-
-def test_a_copy_is_equal_and_of_its_own():
-    loss, data = make_loss(), make_data(BATCH)
-    clone, expected = copy.deepcopy(loss), seeded(loss, data.clone())
-    for param in loss.parameters():
-        param.data.zero_()
-    torch.testing.assert_close(seeded(clone, data.clone()), expected, rtol=0, atol=0)
+        make_rlpd().make_value_estimator(ValueEstimators.TDLambda)
 
 
 def test_bad_options_are_refused():
     for kwargs, message in (
-        ({"actor_value": "max"}, r"actor_value must be one of \('mean', 'min'\), got 'max'"),
-        ({"temperature": "log"}, "temperature must be one of"),
+        ({"actor_value": "max"}, r"actor_value to be one of \('mean', 'min'\), got 'max'"),
+        ({"temperature": "log"}, "temperature to be one of"),
         ({"subset_size": 0}, r"subset_size must be from 1 to the number of critics \(4\), got 0"),
         ({"subset_size": 5}, r"subset_size must be from 1 .* got 5"),
-        ({"alpha_init": 0.0}, "alpha_init must be > 0"),
+        ({"alpha_init": 0.0}, "Expected alpha_init > 0"),
     ):
         with pytest.raises(ValueError, match=message):
-            make_loss(**kwargs)
+            make_rlpd(**kwargs)
     single = ValueOperator(MLP(OBS + ACT, 1, num_cells=[8]), in_keys=["observation", "action"])
     with pytest.raises(ValueError, match="must be a stack of critics.*EnsembleMLP"):
-        EnsembleSACLoss(make_actor(), single)
+        EnsembleSACLoss(make_policy(), single)

@@ -3,10 +3,10 @@ from __future__ import annotations
 import copy
 
 import numpy as np
-import oracle
 import pytest
 import torch
 
+import oracle
 from torchrl_aca import NoiseSchedule
 
 T = 20
@@ -92,16 +92,19 @@ def test_add_noise_takes_one_level_per_action(batch):
     torch.testing.assert_close(together.view(-1, 3), torch.stack(alone))
 
 
-@pytest.mark.parametrize("clip", [True, False])
-@pytest.mark.parametrize("level", [1, 7, 20])
-def test_denoise_step_equals_the_oracle(pair, level, clip):
+@pytest.mark.parametrize("levels", [[1, 20], [1, 2, 9, 20]])
+def test_a_restricted_schedule_keeps_what_is_left_of_the_signal(pair, levels):
     schedule, expected = pair
-    noisy, guided, noise = torch.randn(3, 4, 5, 2, dtype=torch.float64)
-    actual = schedule.denoise_step(noisy, guided, noise, torch.tensor(level), clip=clip)
-    arrays = (noisy.numpy(), guided.numpy(), noise.numpy())
-    np.testing.assert_allclose(
-        actual, oracle.denoising_step(*arrays, expected, level, clip), rtol=1e-12, atol=1e-12
-    )
+    short = schedule.restrict(levels)
+    assert short.num_steps == len(levels) and short.noise_levels.tolist() == levels
+    kept = expected["alphas_cumprod"][np.array(levels) - 1]
+    np.testing.assert_allclose(short.alphas_cumprod, kept, rtol=1e-10)
+    np.testing.assert_allclose(short.alphas, kept / np.append(1, kept[:-1]), rtol=1e-10)
+
+
+def test_restricted_to_all_its_levels_a_schedule_is_itself():
+    schedule = NoiseSchedule.cosine(T)
+    assert schedule.restrict(range(1, T + 1)) is schedule
 
 
 @pytest.mark.parametrize(

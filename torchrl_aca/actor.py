@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -15,8 +16,15 @@ from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
 from torchrl.envs.utils import ExplorationType, exploration_type
 
+from torchrl_aca import chain
 from torchrl_aca import functional as F
-from torchrl_aca.checks import action_spec, check_above, check_at_least, first_parameter
+from torchrl_aca.checks import (
+    action_spec,
+    check_above,
+    check_at_least,
+    check_choice,
+    first_parameter,
+)
 from torchrl_aca.critic import NoiseLevelCriticBase
 from torchrl_aca.custom_critic import as_noise_level_critic
 from torchrl_aca.schedule import NoiseSchedule
@@ -34,7 +42,8 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
     Under the exploration types RANDOM and None the draws are fresh and the exploration noise is
     added. Under DETERMINISTIC, MODE, MEAN and MEDIAN the exploration noise is dropped and the chain
     uses one fixed set of draws, the same for every state: the action is then a function of the
-    observation and the weights alone. Best of N stays.
+    observation and the weights alone. ``deterministic_draws="fresh"`` draws there too. Best of N
+    stays.
 
     With ``sampler="langevin"`` the same chains take ``S`` Langevin steps along the gradient of the
     critic at level 0 instead (Langevin-Q of the paper's appendix). Any critic with a level 0 will
@@ -53,11 +62,12 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
             that holds it under the action's key. Default: actions are in [-1, 1].
         action_dim: size ``A`` of the action, needed only without ``spec`` for a critic without an
             ``action_dim`` of its own.
-        guidance_weight: ``w``. Default: 50.
+        guidance_weight: ``w``. It is part of the actor's state, so that collectors and checkpoints
+            carry it; ``actor.guidance_weight = 3`` sets it. Default: 50.
         num_candidates: ``N``. Default: 32.
         num_inference_steps: number ``S`` of steps of the chain, from 2 to ``T``. Fewer than ``T``
-            visit every few levels only (:meth:`NoiseSchedule.strided`): cheaper, and not quite the
-            same distribution. Default: ``T``, the paper's chain.
+            visit every few levels only (:func:`~torchrl_aca.chain.inference_levels`): cheaper, and
+            not the same distribution. Default: ``T``, the paper's chain.
         normalize_gradient: guide by the unit gradient. Default: True.
         clip_denoised: clip the clean estimate to [-1, 1] in every step, or to [-c, c] for a number
             ``c``; False or 0 leaves it. Langevin steps make no clean estimate. Default: True.
@@ -66,6 +76,8 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         exploration_noise: standard deviation of the exploration noise at ``alpha = 1``, in critic
             units. Default: 0.1.
         alpha_init: initial ``alpha``. Default: 5.
+        deterministic_draws: the chain's draws without exploration: one ``"fixed"`` set, or
+            ``"fresh"`` ones from torch's generator. Default: ``"fixed"``.
         clip_action: clip the action to the spec's bounds. Default: False; as in the official
             code, exploration noise may leave the box, and the loss learns from such actions.
         compile_step: run the denoising step, and the choice among the candidates, through
@@ -90,6 +102,7 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
     center: Tensor
     half_range: Tensor
     fixed_noise: Tensor
+    guidance_weight: Tensor
 
     def __init__(
         self,
@@ -107,6 +120,7 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         langevin_step_size: float = 1e-3,
         exploration_noise: float = 0.1,
         alpha_init: float = 5.0,
+        deterministic_draws: Literal["fixed", "fresh"] = "fixed",
         clip_action: bool = False,
         compile_step: bool = False,
         tile_rows: int = 1024,
@@ -118,8 +132,8 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         check_at_least(0, guidance_weight=guidance_weight, exploration_noise=exploration_noise)
         check_at_least(0, clip_denoised=clip_denoised)
         check_above(0, alpha_init=alpha_init, langevin_step_size=langevin_step_size)
-        if sampler not in ("denoising", "langevin"):
-            raise ValueError(f'Expected sampler="denoising" or "langevin", got {sampler!r}.')
+        check_choice(("denoising", "langevin"), sampler=sampler)
+        check_choice(("fixed", "fresh"), deterministic_draws=deterministic_draws)
         self.critic: NoiseLevelCriticBase = as_noise_level_critic(critic)
         if getattr(critic, "num_steps", schedule.num_steps) != schedule.num_steps:
             raise ValueError(
@@ -132,16 +146,17 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         if num_inference_steps is None:
             num_inference_steps = schedule.num_steps
         self.num_inference_steps = num_inference_steps
-        self.chain_schedule = self.schedule.strided(self.num_inference_steps)
-        self.guidance_weight = guidance_weight
+        levels = chain.inference_levels(schedule.num_steps, num_inference_steps)
+        self.chain_schedule = self.schedule.restrict(levels)
         self.num_candidates = num_candidates
         self.normalize_gradient = normalize_gradient
         self.clip_denoised = clip_denoised
         self.sampler = sampler
         self.langevin_step_size = langevin_step_size
         self.exploration_noise = exploration_noise
+        self.deterministic_draws = deterministic_draws
         self.clip_action = clip_action
-        self.compile_step = compile_step
+        self._run = chain.StepRunner(compile_step)
         self.tile_rows = tile_rows
         self.in_keys = list(in_keys) if in_keys is not None else list(self.critic.observation_keys)
         self.out_keys = list(out_keys)
@@ -162,6 +177,23 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         }
         for name, value in constants.items():
             self.register_buffer(name, value.to(anchor), persistent=False)
+        weight = torch.tensor(guidance_weight, dtype=torch.float64, device=anchor.device)
+        self.register_buffer("guidance_weight", weight)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """A number given to ``guidance_weight`` fills the buffer, whoever else may hold it."""
+        if name == "guidance_weight" and not isinstance(value, Tensor):
+            check_at_least(0, guidance_weight=value)
+            self.guidance_weight.fill_(value)
+        else:
+            super().__setattr__(name, value)
+
+    def _apply(self, fn: Callable, recurse: bool = True) -> CriticGuidedDenoisingActor:
+        """The guidance weight follows device moves, not casts: as a float, it is float64."""
+        weight = self.guidance_weight
+        super()._apply(fn, recurse)
+        self.guidance_weight = weight.to(self.guidance_weight.device)
+        return self
 
     # --- units ------------------------------------------------------------------------------------
 
@@ -173,7 +205,19 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         """The env's units to critic units, [-1, 1]."""
         return (action.to(self.center.dtype) - self.center) / self.half_range
 
-    # --- the chain --------------------------------------------------------------------------------
+    # --- the candidates ---------------------------------------------------------------------------
+
+    def encode(self, observation: Tensor | Sequence[Tensor], batch: Sequence[int]) -> Any:
+        """The critic's features of states of batch shape ``batch``, one row per state.
+
+        Args:
+            observation: as in :meth:`denoise`.
+            batch: the batch shape.
+        """
+        batch = torch.Size(batch)
+        observations = (observation,) if isinstance(observation, Tensor) else observation
+        rows = [o.reshape(batch.numel(), *o.shape[len(batch) :]) for o in observations]
+        return self.critic.encode(*rows)
 
     def denoise(self, observation: Tensor | Sequence[Tensor], noise: Tensor) -> Tensor:
         """Run all chains on given draws: the deterministic core of the actor.
@@ -188,9 +232,7 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         Returns:
             All candidates in critic units, shape ``(N, *batch, A)``.
         """
-        batch = noise.shape[2:-1]
-        rows = noise.reshape(*noise.shape[:2], batch.numel(), noise.shape[-1])
-        return self._denoise(self._encode(observation, batch), rows).reshape(noise.shape[1:])
+        return self._from_noise(observation, noise, keep_path=False).reshape(noise.shape[1:])
 
     def trajectory(self, observation: Tensor | Sequence[Tensor], noise: Tensor) -> Tensor:
         """As :meth:`denoise`, with every step kept: ``a_T .. a_0``, shape ``(S+1, N, *batch, A)``.
@@ -199,10 +241,7 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
             observation: as in :meth:`denoise`.
             noise: as in :meth:`denoise`.
         """
-        batch = noise.shape[2:-1]
-        rows = noise.reshape(*noise.shape[:2], batch.numel(), noise.shape[-1])
-        path = self._path(self._encode(observation, batch), rows)
-        return torch.stack(path).reshape(noise.shape)
+        return self._from_noise(observation, noise, keep_path=True).reshape(noise.shape)
 
     def select(self, observation: Tensor | Sequence[Tensor], candidates: Tensor) -> Tensor:
         """The best candidate by the minimum over the critics at level 0.
@@ -216,100 +255,67 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         """
         batch = candidates.shape[1:-1]
         rows = candidates.reshape(candidates.shape[0], -1, candidates.shape[-1])
-        return self._select(self._encode(observation, batch), rows).reshape(candidates.shape[1:])
+        return self._select(self.encode(observation, batch), rows).reshape(candidates.shape[1:])
 
-    def _encode(self, observation: Tensor | Sequence[Tensor], batch: torch.Size) -> Any:
-        observations = (observation,) if isinstance(observation, Tensor) else observation
-        rows = [o.reshape(batch.numel(), *o.shape[len(batch) :]) for o in observations]
-        return self.critic.encode(*rows)
+    def explore(self, action: Tensor, draw: Tensor) -> Tensor:
+        """The action with exploration noise, in critic units.
 
-    def _denoise(self, features: Any, noise: Tensor) -> Tensor:
-        """Chains of ``noise``, ``(S + 1, N, rows, A)``, a tile of candidates at a time."""
-        tiles = noise.split(self._candidates_per_tile(noise[0]), dim=1)
-        return torch.cat([self._path(features, tile)[-1] for tile in tiles])
-
-    def _candidates_per_tile(self, candidates: Tensor) -> int:
-        """As many candidates of shape ``(N, rows, A)`` as ``tile_rows`` holds.
-
-        On a CPU a tile keeps its activations in the cache, and bounds the memory. Elsewhere, and in
-        a graph that would unroll the tiles, all go at once.
+        Args:
+            action: actions in critic units, shape ``(*batch, A)``.
+            draw: standard normal draws of the same shape.
         """
-        num_candidates, num_rows, _ = candidates.shape
-        if candidates.device.type != "cpu" or torch.compiler.is_compiling():
-            return max(num_candidates, 1)
-        return max(self.tile_rows // max(num_rows, 1), 1)
+        return action + self.exploration_noise * self.log_alpha.exp() * draw
 
-    def _path(self, features: Any, noise: Tensor) -> list[Tensor]:
-        """Every step of the chains of ``noise``, from ``a_T`` to ``a_0``."""
-        steps = torch.arange(self.num_inference_steps, 0, -1, device=noise.device)
-        path = [noise[0]]
-        for step, step_noise in zip(steps, noise[1:], strict=True):
-            last = len(path) == self.num_inference_steps
-            take = self._last_step if last and self.sampler == "denoising" else self._step
-            path.append(take(features, path[-1], step_noise, step))
-        return path
+    def _from_noise(
+        self, observation: Tensor | Sequence[Tensor], noise: Tensor, keep_path: bool
+    ) -> Tensor:
+        batch = noise.shape[2:-1]
+        rows = noise.reshape(*noise.shape[:2], batch.numel(), noise.shape[-1])
+        return self._chains(self.encode(observation, batch), rows, keep_path)
 
-    def _chain_step(self, features: Any, action: Tensor, noise: Tensor, step: Tensor) -> Tensor:
-        """One step of the chosen sampler."""
-        if self.sampler == "denoising":
-            return self._denoise_step(features, action, noise, step)
-        gradient = self._gradient(features, action, torch.zeros_like(step))
-        return F.langevin_step(
-            action, gradient, self.guidance_weight, self.langevin_step_size, noise
+    def _chains(self, features: Any, noise: Tensor, keep_path: bool = False) -> Tensor:
+        """Chains of ``noise``, ``(S + 1, N, rows, A)``, by the chosen sampler."""
+        how: dict[str, Any] = {
+            "keep_path": keep_path,
+            "tile_rows": self.tile_rows,
+            "run": self._run,
+        }
+        if self.sampler == "langevin":
+            gradient = partial(self._clean_gradient, features)
+            weight, step_size = self.guidance_weight, self.langevin_step_size
+            return chain.langevin(gradient, noise, step_size, guidance_weight=weight, **how)
+        predict_noise = partial(self._predict_noise, features)
+        return chain.denoise(
+            predict_noise,
+            self.chain_schedule,
+            noise,
+            clip=self.clip_denoised,
+            predict_last=False,
+            **how,
         )
 
-    def _denoise_step(self, features: Any, action: Tensor, noise: Tensor, step: Tensor) -> Tensor:
-        """One guided step; its number is a tensor, so that one compiled step serves them all."""
-        level = self.chain_schedule.noise_levels.index_select(0, step.reshape(-1) - 1)
-        level = level.reshape(step.shape)
-        index = level - 1 + self.critic.first_level
-        gradient = self._gradient(features, action, index)
-        # Guided as at this level of the whole chain, however long the stride from here.
+    def _predict_noise(self, features: Any, action: Tensor, level: Tensor) -> Tensor:
+        """Guided as at this level of the whole chain, however long the stride from here."""
         variance = self.schedule.posterior_variance
         sigma = self.schedule.at(variance, level, action.dtype).sqrt()
-        predicted_noise = F.guided_noise(gradient, self.guidance_weight, sigma)
-        return self.chain_schedule.denoise_step(
-            action, predicted_noise, noise, step, clip=self.clip_denoised
-        )
+        gradient = self._gradient(features, action, level)
+        return F.guided_noise(gradient, self.guidance_weight, sigma)
 
-    def _last_step(self, features: Any, action: Tensor, noise: Tensor, step: Tensor) -> Tensor:
-        """The step from level 1: sigma is 0 there, so the critic need not be asked."""
-        return self.chain_schedule.denoise_step(
-            action, torch.zeros_like(action), noise, step, clip=self.clip_denoised
-        )
+    def _clean_gradient(self, features: Any, action: Tensor) -> Tensor:
+        return self._gradient(features, action, _clean_level(action))
 
-    def _gradient(self, features: Any, action: Tensor, index: Tensor) -> Tensor:
-        gradient = self.critic.action_gradient(features, action, index)
+    def _gradient(self, features: Any, action: Tensor, level: Tensor) -> Tensor:
+        gradient = self.critic.action_gradient(features, action, level)
         return F.normalize_gradient(gradient) if self.normalize_gradient else gradient
 
-    def _step(self, features: Any, action: Tensor, noise: Tensor, step: Tensor) -> Tensor:
-        return self._run("_chain_step", features, action, noise, step)
-
     def _clean_values(self, features: Any, candidates: Tensor) -> Tensor:
-        """Values at level 0, by which the best of N is chosen."""
-        clean = torch.zeros((), dtype=torch.long, device=candidates.device)
-        return self.critic.evaluate(features, candidates, clean)
+        return self.critic.evaluate(features, candidates, _clean_level(candidates))
 
-    def _run(self, method: str, features: Any, *inputs: Tensor) -> Tensor:
-        """Calls a method, compiled on first use where the actor was built so."""
-        if not self.compile_step or torch.compiler.is_compiling():
-            return getattr(self, method)(features, *inputs)
-        compiled = self.__dict__.setdefault("_compiled", {})
-        if method not in compiled:
-            compiled[method] = torch.compile(getattr(self, method), dynamic=True)
-        # Dynamic, and on copies: acting, targets and evaluation differ in rows, and code compiled
-        # for a view depends on the tensor behind it. Each would be compiled anew.
-        return compiled[method](features, *(tensor.clone() for tensor in inputs))
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Copies and workers compile for themselves: compiled code does not travel."""
-        return {key: value for key, value in self.__dict__.items() if key != "_compiled"}
-
+    @torch.no_grad()
     def _select(self, features: Any, candidates: Tensor) -> Tensor:
-        with torch.no_grad():
-            tiles = candidates.split(self._candidates_per_tile(candidates))
-            values = torch.cat([self._run("_clean_values", features, tile) for tile in tiles])
-        return F.select_best(candidates, values)
+        tiles = chain.tiles(candidates, self.tile_rows, dim=0)
+        values = [self._run(self._clean_values, features, tile) for tile in tiles]
+        return F.select_best(candidates, torch.cat(values))
 
     # --- acting -----------------------------------------------------------------------------------
 
@@ -328,28 +334,27 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
             observation: as in :meth:`denoise`.
             batch: the batch shape.
             num_candidates: ``N`` of this call. Default: the actor's.
-            deterministic: fixed draws and no exploration noise.
+            deterministic: no exploration noise, and draws as ``deterministic_draws`` says.
 
         Raises:
-            ValueError: if ``num_candidates`` is below 1, or exceeds the actor's in a deterministic
-                call.
+            ValueError: if ``num_candidates`` is below 1, or exceeds that of the fixed draws.
         """
         batch = torch.Size(batch)
         num_rows = batch.numel()
         num_chains = self.num_candidates if num_candidates is None else num_candidates
         check_at_least(1, num_candidates=num_chains)
-        features = self._encode(observation, batch)
+        features = self.encode(observation, batch)
         draws = self._draws(num_chains, num_rows, deterministic)
-        action = self._select(features, self._denoise(features, draws[:-1]))
+        action = self._select(features, self._chains(features, draws[:-1]))
         if not deterministic:
-            action = action + self.exploration_noise * self.log_alpha.exp() * draws[-1, 0]
+            action = self.explore(action, draws[-1, 0])
         if self.clip_action:
             action = action.clamp(-1, 1)
         return self.to_env(action).reshape(*batch, self.action_dim)
 
     def _draws(self, num_chains: int, num_rows: int, deterministic: bool) -> Tensor:
         """All draws of a call, ``(S + 2, N, rows, A)``: chain noise, then exploration noise."""
-        if not deterministic:
+        if not deterministic or self.deterministic_draws == "fresh":
             shape = (self.num_inference_steps + 2, num_chains, num_rows, self.action_dim)
             return torch.randn(shape, dtype=self.center.dtype, device=self.center.device)
         if num_chains > self.fixed_noise.shape[1]:
@@ -368,3 +373,7 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         deterministic = exploration_type() not in (None, ExplorationType.RANDOM)
         action = self.sample(observation, batch, deterministic=deterministic)
         return tensordict.set(self.out_keys[0], action)
+
+
+def _clean_level(action: Tensor) -> Tensor:
+    return torch.zeros((), dtype=torch.long, device=action.device)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from tensordict.utils import NestedKey
 from torch import nn
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 
-__all__ = ["action_spec", "check_above", "check_at_least", "first_parameter"]
+__all__ = ["action_spec", "check_above", "check_at_least", "check_choice", "first_parameter"]
 
 
 def check_at_least(least: int, **numbers: float) -> None:
@@ -22,6 +24,13 @@ def check_above(least: float, **numbers: float) -> None:
     for name, number in numbers.items():
         if not number > least:
             raise ValueError(f"Expected {name} > {least}, got {name}={number}.")
+
+
+def check_choice(choices: Sequence[str], **values: str) -> None:
+    """Raise a ValueError for a value that is none of ``choices``."""
+    for name, value in values.items():
+        if value not in choices:
+            raise ValueError(f"Expected {name} to be one of {tuple(choices)}, got {value!r}.")
 
 
 def first_parameter(critic: nn.Module) -> nn.Parameter:

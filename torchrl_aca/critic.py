@@ -23,14 +23,19 @@ class NoiseLevelCriticBase(TensorDictModuleBase):
     not once per candidate and denoising step: :meth:`encode` maps observations to features, and
     :meth:`evaluate` maps features, actions and noise levels to values.
 
+    Noise levels are ``0..T`` for every caller, 0 the clean action. Here alone a level becomes the
+    index by which the network knows it. A subclass defines :meth:`encode` and
+    ``_evaluate(features, action, index)``, and may define ``_action_gradient`` of the same
+    arguments where it knows a faster way than automatic differentiation.
+
     Args:
         observation_keys: keys of the observations, in the order :meth:`encode` takes them.
         action_key: key of the (noisy) action in critic units, [-1, 1].
         noise_level_key: key of the integer noise level, of shape ``(*batch,)``.
         value_key: key of the output, of shape ``(*batch, E)`` with one entry per critic.
-        first_level: index of the first noisy level. ``1``: level 0 is the clean action alone, as in
-            the paper. ``0``: the clean action and the first noisy level share index 0, as in the
-            official code, whose indices are ``0..T-1``.
+        first_level: the network's index of level 1. ``1``: indices are levels, and 0 is the clean
+            action alone, as in the paper. ``0``: the clean action and level 1 share index 0, as in
+            the official code, whose indices are ``0..T-1``.
     """
 
     def __init__(
@@ -62,21 +67,35 @@ class NoiseLevelCriticBase(TensorDictModuleBase):
         Args:
             features: what :meth:`encode` returned for ``B`` states.
             action: actions of shape ``(*N, B, A)``; ``*N`` is empty or ``N`` candidates.
-            noise_level: integers of shape ``()`` or ``(B,)``.
+            noise_level: integers from ``0..T`` of shape ``()`` or ``(B,)``.
         """
-        raise NotImplementedError(
-            f"{type(self).__name__} must define evaluate(features, action, noise_level)."
-        )
+        return self._evaluate(features, action, self._index(noise_level))
 
     def action_gradient(self, features: Any, action: Tensor, noise_level: Tensor) -> Tensor:
         """Gradient of the sum of the critics with respect to the action, shape ``(*N, B, A)``.
 
         The sum, because the official code guides with ``Q_1 + Q_2``. No graph is kept; it works
         under ``no_grad``, ``inference_mode`` and ``torch.compile(fullgraph=True)``.
-        """
 
+        Args:
+            features: as in :meth:`evaluate`.
+            action: as in :meth:`evaluate`.
+            noise_level: as in :meth:`evaluate`.
+        """
+        return self._action_gradient(features, action, self._index(noise_level))
+
+    def _index(self, noise_level: Tensor) -> Tensor:
+        """The network's index of a level."""
+        return noise_level if self.first_level else (noise_level - 1).clamp(min=0)
+
+    def _evaluate(self, features: Any, action: Tensor, index: Tensor) -> Tensor:
+        raise NotImplementedError(
+            f"{type(self).__name__} must define _evaluate(features, action, index)."
+        )
+
+    def _action_gradient(self, features: Any, action: Tensor, index: Tensor) -> Tensor:
         def total(action: Tensor) -> Tensor:
-            return self.evaluate(features, action, noise_level).sum()
+            return self._evaluate(features, action, index).sum()
 
         return torch.func.grad(total)(action.detach()).detach()
 
@@ -197,31 +216,30 @@ class NoiseLevelCritic(NoiseLevelCriticBase):
         first = self._first
         observation_weight, _, level_weight = self._first_weights()
         observation = observations[0].to(first.weight.dtype)
-        num_levels = self.num_steps + self.first_level
-        levels = torch.arange(num_levels, device=first.weight.device, dtype=first.weight.dtype)
-        embedding = F.sinusoidal_embedding(levels, self.embedding_dim)
+        num_indices = self.num_steps + self.first_level
+        indices = torch.arange(num_indices, device=first.weight.device, dtype=first.weight.dtype)
+        embedding = F.sinusoidal_embedding(indices, self.embedding_dim)
         embedding = embedding.expand(self.num_critics, -1, -1)
         embedding = self.level_out(self.activation(self.level_in(embedding)))
         state_share = observation.expand(self.num_critics, -1, -1) @ observation_weight
         return state_share, torch.baddbmm(first.bias, embedding, level_weight)
 
-    def evaluate(self, features: Any, action: Tensor, noise_level: Tensor) -> Tensor:
-        """See :meth:`NoiseLevelCriticBase.evaluate`."""
-        x = self.activation(self._first_layer(features, action, noise_level))
+    def _evaluate(self, features: Any, action: Tensor, index: Tensor) -> Tensor:
+        x = self.activation(self._first_layer(features, action, index))
         for layer in self._others:
             x = self.activation(layer(x))
         return (
             self.value(x).squeeze(-1).movedim(0, -1).reshape(*action.shape[:-1], self.num_critics)
         )
 
-    def action_gradient(self, features: Any, action: Tensor, noise_level: Tensor) -> Tensor:
-        """See :meth:`NoiseLevelCriticBase.action_gradient`; the chain rule written out.
+    def _action_gradient(self, features: Any, action: Tensor, index: Tensor) -> Tensor:
+        """The chain rule written out.
 
         Forward, each layer keeps the slope of its activation; backward, the gradient is multiplied
         by slope and transposed weight, layer by layer, down to the action's share of the first.
         """
         with torch.no_grad():
-            x = self._first_layer(features, action, noise_level)
+            x = self._first_layer(features, action, index)
             x, slope = F.activation_and_slope(self.activation, x)
             slopes = [slope]
             for layer in self._others:
@@ -250,11 +268,11 @@ class NoiseLevelCritic(NoiseLevelCriticBase):
         sizes = [self.observation_dim, self.action_dim, self.embedding_dim]
         return self._first.weight.split(sizes, dim=1)
 
-    def _first_layer(self, features: Any, action: Tensor, noise_level: Tensor) -> Tensor:
+    def _first_layer(self, features: Any, action: Tensor, index: Tensor) -> Tensor:
         """Pre-activation of the first layer, shape ``(E, rows, H)``."""
         state_share, level_share = features
         _, action_weight, _ = self._first_weights()
-        share = state_share + level_share[:, noise_level.reshape(-1)]  # (E, B, H)
+        share = state_share + level_share[:, index.reshape(-1)]  # (E, B, H)
         rows = action.reshape(-1, self.action_dim).expand(self.num_critics, -1, -1)
         product = rows @ action_weight
         num_states = share.shape[1]

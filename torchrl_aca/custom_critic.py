@@ -24,7 +24,12 @@ class CustomCritic(NoiseLevelCriticBase):
     ``module(observation, action, noise_level)``.
 
     The module sees flat batches: observations of shape ``(rows, ...)``, actions ``(rows, A)`` in
-    critic units, integer noise levels ``(rows,)``. Its output has shape ``(rows, E)``.
+    critic units, integer noise levels ``(rows,)``, where 0 is the clean action. Its output has the
+    shape ``(rows, E)``.
+
+    Keep a module that changes its buffers while it trains, such as BatchNorm, in ``eval`` mode when
+    actions are drawn: the chain cannot differentiate through a change of buffers. What becomes of
+    buffers in a loss is told at :class:`ACALoss`.
 
     Args:
         module: the network. A module that ignores the noise level is a plain critic ``Q(s, a)``.
@@ -82,12 +87,11 @@ class CustomCritic(NoiseLevelCriticBase):
             states.set(key, observation)
         return self._encoder(states).select(*self._feature_keys)
 
-    def evaluate(self, features: Any, action: Tensor, noise_level: Tensor) -> Tensor:
-        """See :meth:`NoiseLevelCriticBase.evaluate`."""
+    def _evaluate(self, features: Any, action: Tensor, index: Tensor) -> Tensor:
         batch = action.shape[:-1]
         rows = features.expand(batch).reshape(-1)
         rows.set(self.action_key, action.reshape(-1, action.shape[-1]))
-        rows.set(self.noise_level_key, noise_level.expand(batch).reshape(-1))
+        rows.set(self.noise_level_key, index.expand(batch).reshape(-1))
         value = self._head(rows).get(self.value_key)
         if value.ndim != 2:
             raise ValueError(

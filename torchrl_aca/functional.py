@@ -95,10 +95,14 @@ def posterior_mean(clean: Tensor, noisy_action: Tensor, coef1: Tensor, coef2: Te
 
 
 def langevin_step(
-    action: Tensor, gradient: Tensor, guidance_weight: float, step_size: float, noise: Tensor
+    action: Tensor,
+    gradient: Tensor,
+    guidance_weight: float | Tensor,
+    step_size: Tensor,
+    noise: Tensor,
 ) -> Tensor:
     """Langevin step ``a + eps/2 w grad_a Q(s, a) + sqrt(eps) z`` (paper, Langevin appendix)."""
-    return action + step_size / 2 * guidance_weight * gradient + math.sqrt(step_size) * noise
+    return action + step_size / 2 * guidance_weight * gradient + step_size.sqrt() * noise
 
 
 # --- critic ---------------------------------------------------------------------------------------
@@ -130,13 +134,18 @@ def mish_and_slope(x: Tensor) -> tuple[Tensor, Tensor]:
     bit of float64, so the exponent is cut there and never overflows.
 
     The steps in between reuse their memory, because fresh memory costs a CPU more than the
-    arithmetic: the results are not to be differentiated.
+    arithmetic: the results are not to be differentiated. Float16, where ``n`` is infinite from
+    ``x = 5.6`` on, is computed in float32, as PyTorch's own Mish is.
     """
-    e = x.clamp(max=40.0).exp_()
+    if x.dtype == torch.float16:
+        value, slope = mish_and_slope(x.float())
+        return value.half(), slope.half()
+    bounded = x.clamp(max=40.0)
+    e = bounded.exp()
     n = (e + 2).mul_(e)
     inverse = (n + 2).reciprocal_()
     gate = n.mul_(inverse)
-    slope = (e + 1).mul_(e).mul_(inverse).mul_(inverse).mul_(4 * x)
+    slope = (e + 1).mul_(e).mul_(inverse).mul_(inverse).mul_(bounded.mul_(4))
     return x * gate, slope.add_(gate)
 
 

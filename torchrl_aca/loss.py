@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
-from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
@@ -17,6 +16,7 @@ from torchrl.objectives.utils import distance_loss
 
 from torchrl_aca import functional as F
 from torchrl_aca.actor import CriticGuidedDenoisingActor
+from torchrl_aca.checks import check_at_least, check_choice
 from torchrl_aca.critic import NoiseLevelCriticBase
 from torchrl_aca.td_loss import TDLoss, next_key
 
@@ -40,7 +40,9 @@ class ACALoss(TDLoss):
     computed after the first step: call the methods one by one for that.
 
     The loss holds the very parameters of ``actor_network.critic`` and its ``log_alpha``, so actor,
-    optimiser and collector never need synchronising in one process.
+    optimiser and collector never need synchronising in one process. Buffers of a critic of one's
+    own, running statistics say, are shared in the same way, through casts and copies; the target
+    critics take over the online buffers as they are, for target updaters move parameters alone.
 
     Args:
         actor_network: the actor; its critic is the network that is trained.
@@ -63,10 +65,13 @@ class ACALoss(TDLoss):
             the input and metrics are left out. Default: ``"mean"``.
         use_prioritized_weights: weigh rows by ``priority_weight`` where it is present. Default:
             ``"auto"``.
+        use_given_draws: take random draws from the input where it has them, see below; False draws
+            always. Default: True.
 
-    Random draws are taken from the input where it has them: ``noise_level`` (``1..T``, or
-    ``0..T-1`` with ``first_level=0``), ``noise`` (standard normal, shape of the action) and
-    ``next_action`` (``a'_0`` in env units).
+    Random draws are taken from the input where it has them: ``noise_level`` (from ``1..T``),
+    ``noise`` (standard normal, shape of the action) and ``next_action`` (``a'_0`` in env units).
+    Where replay data hold entries of these names that mean something else, rename what the loss
+    looks for with :meth:`set_keys`, or pass ``use_given_draws=False``.
 
     Raises:
         ValueError: on an unknown option, or a ``qvalue_network`` that is not the actor's critic.
@@ -128,8 +133,6 @@ class ACALoss(TDLoss):
 
     actor_network: CriticGuidedDenoisingActor
     qvalue_network: NoiseLevelCriticBase
-    qvalue_network_params: TensorDictParams
-    target_qvalue_network_params: TensorDictParams
     target_entropy: Tensor
 
     def __init__(
@@ -147,6 +150,7 @@ class ACALoss(TDLoss):
         delay_qvalue: bool = True,
         reduction: Literal["none", "mean", "sum"] | None = None,
         use_prioritized_weights: bool | Literal["auto"] = "auto",
+        use_given_draws: bool = True,
     ) -> None:
         super().__init__()
         critic = actor_network.critic
@@ -155,24 +159,24 @@ class ACALoss(TDLoss):
                 "qvalue_network must be actor_network.critic: in ACA the critic is the actor. "
                 "Leave it out, or build the actor with this network."
             )
-        if noise_level_target not in ("mean", "self"):
-            raise ValueError(
-                f'noise_level_target must be "mean" or "self", got {noise_level_target!r}.'
-            )
-        if num_target_candidates is not None and num_target_candidates < 1:
-            raise ValueError(f"num_target_candidates must be >= 1, got {num_target_candidates}.")
+        check_choice(("mean", "self"), noise_level_target=noise_level_target)
+        if num_target_candidates is None:
+            num_target_candidates = actor_network.num_candidates
+        check_at_least(1, num_target_candidates=num_target_candidates)
         # The actor is no submodule: its parameters are listed below, and only once.
         self.__dict__["actor_network"] = actor_network
         self.convert_to_functional(critic, "qvalue_network", create_target_params=delay_qvalue)
         self.log_alpha = actor_network.log_alpha
+        self.register_buffer("guidance_weight", actor_network.guidance_weight)
         self.delay_qvalue = delay_qvalue
-        self.num_target_candidates = num_target_candidates or actor_network.num_candidates
+        self.num_target_candidates = num_target_candidates
         self.noise_level_target = noise_level_target
         self.entropy_noise_scale = entropy_noise_scale
         self.reward_scale = reward_scale
         self.loss_function = loss_function
         self.reduction = reduction or "mean"
         self.use_prioritized_weights = use_prioritized_weights
+        self.use_given_draws = use_given_draws
         if target_entropy == "auto":
             target_entropy = -target_entropy_scale * actor_network.action_dim
         self.register_buffer("target_entropy", self.log_alpha.new_tensor(target_entropy))
@@ -188,7 +192,9 @@ class ACALoss(TDLoss):
         """TD loss at level 0; writes the TD error, shape ``(*batch,)``, to ``tensordict``."""
         observation, action = self._state_and_action(tensordict)
         target = self._target_value(tensordict)
-        (value,) = self._values(observation, (action, self._clean_level(action)))
+        with self._critics(self.qvalue_network_params):
+            features = self.actor_network.encode(observation, action.shape[:-1])
+            value = self._values(features, action, self._clean_level(action))
         error = distance_loss(value, target.expand_as(value), self.loss_function).sum(-1)
         td_error = (value.detach() - target).abs().amax(-1)
         tensordict.set(self.tensor_keys.priority, td_error)
@@ -199,17 +205,19 @@ class ACALoss(TDLoss):
     def noise_level_loss(self, tensordict: TensorDictBase) -> TensorDict:
         """Regression of ``Q(s, a_t, t)`` on ``Q(s, a_0, 0)``."""
         observation, action = self._state_and_action(tensordict)
-        schedule, first_level = self.actor_network.schedule, self.qvalue_network.first_level
-        level = tensordict.get(self.tensor_keys.noise_level, None)
+        schedule = self.actor_network.schedule
+        level = self._given(tensordict, self.tensor_keys.noise_level)
         if level is None:
-            high = first_level + schedule.num_steps
-            level = torch.randint(first_level, high, action.shape[:-1], device=action.device)
-        noise = tensordict.get(self.tensor_keys.noise, None)
+            shape, high = action.shape[:-1], schedule.num_steps + 1
+            level = torch.randint(1, high, shape, device=action.device)
+        noise = self._given(tensordict, self.tensor_keys.noise)
         noise = torch.randn_like(action) if noise is None else noise
-        noisy_action = schedule.add_noise(action, noise, level - first_level + 1)
-        clean_value, value = self._values(
-            observation, (action, self._clean_level(action)), (noisy_action, level)
-        )
+        noisy_action = schedule.add_noise(action, noise, level)
+        with self._critics(self.qvalue_network_params):
+            features = self.actor_network.encode(observation, action.shape[:-1])
+            with torch.no_grad():
+                clean_value = self._values(features, action, self._clean_level(action))
+            value = self._values(features, noisy_action, level)
         target = F.noise_level_target(clean_value, self.noise_level_target)
         error = distance_loss(value, target, self.loss_function).sum(-1)
         metrics = {"noisy_value": value.detach().mean()}
@@ -249,29 +257,15 @@ class ACALoss(TDLoss):
 
     # --- their parts ------------------------------------------------------------------------------
 
-    def _values(
-        self,
-        observation: Sequence[Tensor],
-        *queries: tuple[Tensor, Tensor],
-        params: TensorDictParams | None = None,
-    ) -> list[Tensor]:
-        """Critic values of shape ``(*batch, E)``, one for each (action, level) in ``queries``.
+    def _values(self, features: Any, action: Tensor, level: Tensor) -> Tensor:
+        """Critic values of shape ``(*batch, E)``."""
+        rows = action.reshape(-1, action.shape[-1])
+        value = self.qvalue_network.evaluate(features, rows, level.reshape(-1))
+        return value.reshape(*action.shape[:-1], value.shape[-1])
 
-        The states are encoded once for all queries, under ``params`` (default: the online ones).
-        Only the last query is differentiated: what comes before it are targets.
-        """
-        critic, batch = self.qvalue_network, queries[0][0].shape[:-1]
-        rows = [o.reshape(-1, *o.shape[len(batch) :]) for o in observation]
-        params = self.qvalue_network_params if params is None else params
-        values = []
-        with params.to_module(critic, preserve_module_state=False):
-            features = critic.encode(*rows)
-            for number, (action, level) in enumerate(queries, start=1):
-                with torch.set_grad_enabled(torch.is_grad_enabled() and number == len(queries)):
-                    flat = action.reshape(-1, action.shape[-1])
-                    value = critic.evaluate(features, flat, level.reshape(-1))
-                values.append(value.reshape(*batch, value.shape[-1]))
-        return values
+    def _given(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor | None:
+        """Draws that the input holds, if any and if wanted."""
+        return tensordict.get(key, None) if self.use_given_draws else None
 
     @torch.no_grad()
     def sample_next_action(self, tensordict: TensorDictBase) -> Tensor:
@@ -291,15 +285,13 @@ class ACALoss(TDLoss):
         """TD target ``y`` of shape ``(*batch, 1)``, made by the value estimator."""
         actor, keys = self.actor_network, self.tensor_keys
         observation = [tensordict[next_key(key)] for key in actor.in_keys]
-        next_action = tensordict.get(keys.next_action, None)
+        next_action = self._given(tensordict, keys.next_action)
         if next_action is None:
             next_action = self.sample_next_action(tensordict)
         next_action = actor.from_env(next_action)
-        (next_values,) = self._values(
-            observation,
-            (next_action, self._clean_level(next_action)),
-            params=self.target_qvalue_network_params,
-        )
+        with self._critics(self._target_params()):
+            features = actor.encode(observation, next_action.shape[:-1])
+            next_values = self._values(features, next_action, self._clean_level(next_action))
         next_value = next_values.amin(-1, keepdim=True)
         return self._td_target(tensordict, next_value, self.reward_scale)
 
@@ -324,16 +316,13 @@ class ACALoss(TDLoss):
             return None
         return tensordict.get(self.tensor_keys.priority_weight, None)
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> ACALoss:
-        """A copy whose actor holds the copy's parameters; TensorDict's own copy would part them."""
-        clone = self.__class__.__new__(self.__class__)
-        memo[id(self)] = clone
-        clone.__dict__.update(copy.deepcopy(self.__dict__, memo))
-        clone.qvalue_network_params.to_module(clone.qvalue_network)
-        return clone
+    def _tie(self) -> None:
+        """The actor holds the loss's parameters and buffers."""
+        super()._tie()
+        self.actor_network.log_alpha = self.log_alpha
+        self.guidance_weight = self.actor_network.guidance_weight
 
     def _apply(self, fn: Callable) -> ACALoss:
-        """Take the actor along: its buffers are not the loss's, its parameters are the same."""
-        super()._apply(fn)
+        """Take the actor along."""
         self.actor_network._apply(fn)
-        return self
+        return super()._apply(fn)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -23,10 +23,10 @@ class NoiseSchedule(nn.Module):
     Args:
         betas: variances ``beta_1..beta_T`` of the forward process, each in (0, 1).
         noise_levels: the level that each row belongs to, where they are not ``1..T``; what
-            :meth:`strided` gives.
+            :meth:`restrict` gives.
 
     Attributes:
-        noise_levels: integers, ``1..T`` unless the schedule is a strided one.
+        noise_levels: integers, ``1..T`` unless the schedule is a restricted one.
         betas: ``beta_t``.
         alphas: ``1 - beta_t``.
         alphas_cumprod: ``alpha_bar_t``, the product of the alphas up to ``t``.
@@ -103,30 +103,21 @@ class NoiseSchedule(nn.Module):
         """Number ``T`` of noise levels."""
         return len(self.betas)
 
-    def strided(self, num_steps: int) -> NoiseSchedule:
-        """The schedule of a chain that visits only ``num_steps`` of the levels.
+    def restrict(self, levels: Sequence[int]) -> NoiseSchedule:
+        """The schedule of a chain that visits only some of the levels.
 
-        The levels lie evenly from 1 to ``T``, both included, and keep their ``alpha_bar``, so
-        ``beta_i = 1 - alpha_bar(t_i) / alpha_bar(t_{i-1})``. A reverse chain on it takes the steps
-        of DDIM with ``eta = 1`` (Song et al. 2021, eq. 12 and 16); with all ``T`` it is the chain
-        itself.
+        They keep their ``alpha_bar``, so ``beta_i = 1 - alpha_bar(t_i) / alpha_bar(t_{i-1})``; with
+        all of them it is the schedule itself.
 
         Args:
-            num_steps: number of levels, from 2 to ``T``.
-
-        Raises:
-            ValueError: if it is not one of those.
+            levels: rising levels, from ``1..T``.
         """
-        if num_steps == self.num_steps:
+        if list(levels) == self.noise_levels.tolist():
             return self
-        if not isinstance(num_steps, int) or not 2 <= num_steps < self.num_steps:
-            raise ValueError(
-                f"Expected a number of steps from 2 to {self.num_steps}, got {num_steps!r}."
-            )
-        rows = torch.linspace(0, self.num_steps - 1, num_steps).round().long()
-        cumprod = self.alphas_cumprod[rows.to(self.alphas_cumprod.device)]
+        rows = torch.tensor(levels, device=self.betas.device) - 1
+        cumprod = self.alphas_cumprod[rows]
         previous = torch.cat([torch.ones_like(cumprod[:1]), cumprod[:-1]])
-        return NoiseSchedule(1 - cumprod / previous, self.noise_levels[rows.to(cumprod.device)])
+        return NoiseSchedule(1 - cumprod / previous, self.noise_levels[rows])
 
     def add_noise(self, action: Tensor, noise: Tensor, noise_level: Tensor) -> Tensor:
         """Noise ``action`` to ``noise_level``.
@@ -140,41 +131,6 @@ class NoiseSchedule(nn.Module):
             ``a_t`` of shape ``(*batch, A)``.
         """
         return F.add_noise(action, noise, self.at(self.alphas_cumprod, noise_level, action.dtype))
-
-    def denoise_step(
-        self,
-        noisy_action: Tensor,
-        predicted_noise: Tensor,
-        noise: Tensor,
-        noise_level: Tensor,
-        clip: bool | float = True,
-    ) -> Tensor:
-        """One step of the reverse chain, ``a_t -> a_{t-1}`` (Definition 1 of the paper).
-
-        Args:
-            noisy_action: ``a_t`` of shape ``(*batch, A)``.
-            predicted_noise: ``eps_hat``, same shape.
-            noise: standard normal draws, broadcastable to that shape.
-            noise_level: ``t`` in ``1..T``, an integer tensor of shape ``(*batch,)`` or ``()``.
-            clip: clip the clean estimate to [-1, 1] (official code) or leave it (paper's text); a
-                number ``c`` clips to [-c, c].
-
-        Returns:
-            ``a_{t-1}`` of shape ``(*batch, A)``.
-        """
-        coef1, coef2, alpha_cumprod, variance = (
-            self.at(constants, noise_level, noisy_action.dtype)
-            for constants in (
-                self.posterior_mean_coef1,
-                self.posterior_mean_coef2,
-                self.alphas_cumprod,
-                self.posterior_variance,
-            )
-        )
-        # 1. clean estimate   2. its box   3. posterior mean   4. posterior noise
-        clean = F.predict_clean(noisy_action, predicted_noise, alpha_cumprod)
-        clean = clean.clamp(-float(clip), float(clip)) if clip else clean
-        return F.posterior_mean(clean, noisy_action, coef1, coef2) + variance.sqrt() * noise
 
     @staticmethod
     def at(constants: Tensor, noise_level: Tensor, dtype: torch.dtype) -> Tensor:

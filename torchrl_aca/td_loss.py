@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import copy
 from abc import abstractmethod
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.utils import NestedKey
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.utils import dispatch_value_estimator
 
@@ -18,7 +21,11 @@ class TDLoss(LossModule):
     """Base class of losses that regress critics on ``r + gamma (1 - terminated) V(s')``.
 
     A subclass has ``_AcceptedKeys`` with ``action``, ``value``, ``reward``, ``done`` and
-    ``terminated``, its losses, and what is declared here.
+    ``terminated``, its losses, ``qvalue_network`` made functional, and what is declared here.
+
+    The critics' parameters and buffers in the loss are those of ``qvalue_network`` itself. Buffers,
+    such as running statistics, have no targets of their own: before each use the target critics
+    take over the online ones, as no target updater of TorchRL moves buffers.
 
     Attributes:
         loss_names: keys of the losses in the output.
@@ -31,6 +38,9 @@ class TDLoss(LossModule):
     metric_names: tuple[str, ...]
     default_value_estimator = ValueEstimators.TD0
     SUPPORTED_VALUE_ESTIMATORS: tuple[ValueEstimators, ...] = (ValueEstimators.TD0,)
+    qvalue_network: nn.Module
+    qvalue_network_params: TensorDictParams
+    target_qvalue_network_params: TensorDictParams
 
     def __init__(self) -> None:
         self._in_keys: list[NestedKey] | None = None
@@ -40,6 +50,24 @@ class TDLoss(LossModule):
     @abstractmethod
     def _state_keys(self) -> list[NestedKey]:
         """Keys of what the networks see of a state."""
+
+    @contextmanager
+    def _critics(self, params: TensorDictBase) -> Iterator[Any]:
+        """``qvalue_network`` on other parameters; its own return after an exception as well."""
+        critics = self.qvalue_network
+        # As a context, `to_module` would leave the module as it is on an exception.
+        own = params.to_module(critics, preserve_module_state=False)
+        try:
+            yield critics
+        finally:
+            own.to_module(critics, preserve_module_state=False, return_swap=False)
+
+    def _target_params(self) -> TensorDictBase:
+        """The target parameters, with the online buffers."""
+        online, target = self.qvalue_network_params, self.target_qvalue_network_params
+        for name, buffer in online.named_buffers():
+            target.get(tuple(name.split("."))).copy_(buffer)
+        return target
 
     def _td_target(
         self, tensordict: TensorDictBase, next_value: Tensor, reward_scale: float = 1.0
@@ -100,6 +128,24 @@ class TDLoss(LossModule):
         if self._value_estimator is not None:
             self._value_estimator.set_keys(**self._estimator_keys())
         self._in_keys = None
+
+    def _tie(self) -> None:
+        """Give ``qvalue_network`` the loss's parameters and buffers."""
+        self.qvalue_network_params.to_module(self.qvalue_network)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Any:
+        """A copy of its own whose parts hold the same parameters."""
+        clone = self.__class__.__new__(self.__class__)
+        memo[id(self)] = clone
+        clone.__dict__.update(copy.deepcopy(self.__dict__, memo))
+        clone._tie()
+        return clone
+
+    def _apply(self, fn: Callable) -> Any:
+        """Casts and moves make new buffers, in the loss and in its parts: tie them again."""
+        super()._apply(fn)
+        self._tie()
+        return self
 
     @property
     def in_keys(self) -> list[NestedKey]:

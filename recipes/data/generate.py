@@ -5,11 +5,12 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import gymnasium as gym
 import numpy as np
 from omegaconf import OmegaConf
+from pydantic import Field
 
 from data.episodes import Episode, replayed, rollouts, sampled_actions, uniform_actions
 from data.sac_run import evaluations, finished_sac_run
@@ -19,6 +20,10 @@ from torchrl_aca.offline.registry import ROOT
 from torchrl_aca.training.config import Count, Env, Section, Seed
 from torchrl_aca.training.envs import make_env, task_name
 from torchrl_aca.training.report import plot_returns, versions
+
+Tier = Literal["random", "medium", "medium_replay"]
+Statistic = Literal["mean", "std", "min", "max"]
+Band = Annotated[list[float | None], Field(min_length=2, max_length=2)]
 
 
 class SACRun(Section):
@@ -32,14 +37,14 @@ class SACRun(Section):
 class GeneratorConfig(Section):
     """`make_dataset.yaml`."""
 
-    tier: Literal["random", "medium", "medium_replay"]
+    tier: Tier
     env: Env
     path: str | None
     episodes: Count
     seed: Seed
     sac: SACRun
     check: bool
-    bands: dict[str, dict[str, dict[str, list[float | None]]]]
+    bands: dict[str, dict[Tier, dict[Statistic, Band]]]
 
 
 def make_dataset(cfg: GeneratorConfig) -> OfflineDataset:

@@ -45,7 +45,7 @@ def finished_sac_run(env_name: str, seed: int, overrides: Sequence[str], run_dir
         apply_overrides(stored, wanted, [*typed, *ENDS])
         if not is_finished(run_dir, stored):
             ends = [f"{key}={_selected(wanted, key)}" for key in ENDS]
-            _run(f"resume={run_dir}", *ends)
+            _run("--config-name", "dataset_sac", f"resume={run_dir}", *overrides, *ends)
     stored = read_config(run_dir)
     if stored is None or not is_finished(run_dir, stored):
         raise RunError(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
@@ -16,6 +16,7 @@ from torchrl.data import Bounded, Composite, TensorSpec
 from torchrl.modules import ProbabilisticActor
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 
+from torchrl_aca.checks import check_above, check_choice
 from torchrl_aca.td_loss import TDLoss
 
 __all__ = ["EnsembleSACLoss"]
@@ -130,8 +131,6 @@ class EnsembleSACLoss(TDLoss):
 
     actor_network: ProbabilisticActor
     qvalue_network: TensorDictModule
-    qvalue_network_params: TensorDictParams
-    target_qvalue_network_params: TensorDictParams
     target_entropy: Tensor
 
     def __init__(
@@ -151,15 +150,14 @@ class EnsembleSACLoss(TDLoss):
     ) -> None:
         super().__init__()
         self.num_qvalue_nets = _stack_size(qvalue_network)
-        _check_choice("actor_value", actor_value, ("mean", "min"))
-        _check_choice("temperature", temperature, tuple(TEMPERATURES))
+        check_choice(("mean", "min"), actor_value=actor_value)
+        check_choice(tuple(TEMPERATURES), temperature=temperature)
         if not 1 <= subset_size <= self.num_qvalue_nets:
             raise ValueError(
                 f"subset_size must be from 1 to the number of critics ({self.num_qvalue_nets}), "
                 f"got {subset_size}."
             )
-        if not alpha_init > 0:
-            raise ValueError(f"alpha_init must be > 0, got {alpha_init}.")
+        check_above(0, alpha_init=alpha_init)
         self.actor_network = actor_network
         self.convert_to_functional(qvalue_network, "qvalue_network", create_target_params=True)
         self.subset_size = subset_size
@@ -264,10 +262,10 @@ class EnsembleSACLoss(TDLoss):
 
     def _values(self, params: TensorDictBase, states: TensorDictBase, action: Tensor) -> Tensor:
         """Critic values under ``params``, one per member in them: ``(*batch, members)``."""
-        critic = self.qvalue_network
-        data = states.select(*critic.in_keys, strict=False).set(self._policy_action_key, action)
-        with params.to_module(critic, preserve_module_state=False):
-            return critic(data)[self.tensor_keys.state_action_value]
+        keys = self.qvalue_network.in_keys
+        data = states.select(*keys, strict=False).set(self._policy_action_key, action)
+        with self._critics(params) as critics:
+            return critics(data)[self.tensor_keys.state_action_value]
 
     def _subset(self) -> Tensor:
         """Indices of the members in ``M``, drawn anew."""
@@ -282,7 +280,7 @@ class EnsembleSACLoss(TDLoss):
         next_action, log_prob = self._sample(tensordict["next"])
         members = self._subset()
         # Only the members in M are evaluated: with two of ten, a fifth of the work.
-        params = self.target_qvalue_network_params.data.apply(lambda stack: stack[members])
+        params = self._target_params().data.apply(lambda stack: stack[members])
         next_values = self._values(params, tensordict["next"], next_action)
         next_value = next_values.amin(-1, keepdim=True)
         if self.entropy_backup:
@@ -304,8 +302,3 @@ def _stack_size(network: nn.Module) -> int:
             "torchrl_aca.baselines.EnsembleMLP is one."
         )
     return sizes.pop()
-
-
-def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise ValueError(f"{name} must be one of {choices}, got {value!r}.")

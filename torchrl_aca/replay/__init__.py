@@ -7,6 +7,7 @@ from torchrl_aca.replay.buffer import (
     transitions,
 )
 from torchrl_aca.replay.mixture import MixedReplayBuffer
+from torchrl_aca.replay.multi_step import with_last_flags
 
 __all__ = [
     "TRANSITION_KEYS",
@@ -14,4 +15,5 @@ __all__ = [
     "MixedReplayBuffer",
     "make_replay_buffer",
     "transitions",
+    "with_last_flags",
 ]

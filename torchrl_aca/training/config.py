@@ -7,7 +7,7 @@ import re
 from typing import Annotated, Any, Literal, NoReturn, TypeVar
 
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import ErrorDetails, PydanticCustomError
 
@@ -164,6 +164,9 @@ def checked(schema: type[Schema], cfg: DictConfig | dict[str, Any]) -> Schema:
     """
     try:
         values = OmegaConf.to_container(OmegaConf.create(cfg), resolve=True, throw_on_missing=True)
+    except MissingMandatoryValue as error:
+        key = error.full_key
+        raise RunError(f"{key}=???: expected a value. Set it with {key}=... .") from None
     except OmegaConfBaseException as error:
         raise RunError(f"the configuration is incomplete: {str(error).splitlines()[0]}.") from None
     try:
@@ -175,7 +178,7 @@ def checked(schema: type[Schema], cfg: DictConfig | dict[str, Any]) -> Schema:
 def _told(error: ErrorDetails) -> str:
     """One mistake in one sentence: key, got, expected."""
     context = error.get("ctx", {})
-    place = [str(part) for part in error["loc"]]
+    place = [str(part) for part in error["loc"] if part != "[key]"]
     key = ".".join([*place, context["key"]] if "key" in context else place)
     value = context.get("value", error["input"])
     if error["type"] == "missing":
@@ -184,5 +187,5 @@ def _told(error: ErrorDetails) -> str:
         return f"{key}={value!r}: there is no such key. Leave it out, or correct its name."
     if error["type"] in ("model_type", "model_attributes_type"):
         return f"{key}={value!r}: expected a section with keys of its own, as {key}.KEY=... ."
-    expected = re.sub(r"^Input should be ", "", error["msg"])
+    expected = re.sub(r"^Input should be |^List should have | after validation.*", "", error["msg"])
     return f"{key}={value!r}: expected {expected}. Set it with {key}=... ."

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import warnings
 from collections.abc import Iterator
@@ -10,6 +9,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
@@ -18,22 +18,7 @@ from torchrl.envs import GymWrapper
 
 from torchrl_aca.errors import RunError
 
-
-def import_mujoco() -> Any:
-    """Imports MuJoCo, which loads the renderer that `MUJOCO_GL` names at once.
-
-    Raises:
-        RunError: If that fails.
-    """
-    try:
-        import mujoco
-    except Exception as error:  # each renderer has exceptions of its own
-        raise RunError(
-            f"MuJoCo cannot be loaded with MUJOCO_GL={os.environ.get('MUJOCO_GL')!r}: {error}. "
-            "Unset MUJOCO_GL, or install the library of that renderer (libOSMesa for osmesa, "
-            "libEGL for egl)."
-        ) from error
-    return mujoco
+_INTEGRATION_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
 class ResumableEnv(gym.Wrapper):
@@ -69,7 +54,7 @@ class ResumableEnv(gym.Wrapper):
     def state_dict(self) -> dict[str, Any]:
         """Returns random stream, elapsed steps, last observation and the simulator's arrays."""
         state: dict[str, Any] = {"random": self.unwrapped.np_random.bit_generator.state}
-        if isinstance(getattr(self.unwrapped, "data", None), import_mujoco().MjData):
+        if isinstance(getattr(self.unwrapped, "data", None), mujoco.MjData):
             state["elapsed_steps"] = self.time_limit._elapsed_steps if self.time_limit else None
             state["observation"] = torch.from_numpy(np.array(self._observation))
             state["simulation"] = _simulation_state(self.unwrapped.model, self.unwrapped.data)
@@ -106,10 +91,8 @@ class ResumableEnv(gym.Wrapper):
 
 
 def _simulation_state(model: Any, data: Any) -> dict[str, torch.Tensor]:
-    mujoco = import_mujoco()
-    kind = mujoco.mjtState.mjSTATE_INTEGRATION
-    integration = np.empty(mujoco.mj_stateSize(model, kind))
-    mujoco.mj_getState(model, data, integration, kind)
+    integration = np.empty(mujoco.mj_stateSize(model, _INTEGRATION_STATE))
+    mujoco.mj_getState(model, data, integration, _INTEGRATION_STATE)
     # The next step follows from the integration state alone, but rewards and observations also
     # read derived arrays (body positions, contact forces) that MuJoCo leaves half a step behind.
     # What has a size in fresh data is what does not depend on the contacts of the moment.
@@ -126,9 +109,7 @@ def _simulation_state(model: Any, data: Any) -> dict[str, torch.Tensor]:
 
 
 def _load_simulation_state(model: Any, data: Any, state: dict[str, torch.Tensor]) -> None:
-    mujoco = import_mujoco()
-    kind = mujoco.mjtState.mjSTATE_INTEGRATION
-    mujoco.mj_setState(model, data, state["integration"].numpy(), kind)
+    mujoco.mj_setState(model, data, state["integration"].numpy(), _INTEGRATION_STATE)
     for name, value in state.items():
         if name != "integration":
             getattr(data, name)[...] = value.numpy()
@@ -232,7 +213,6 @@ def _check_spaces(name: str, env: gym.Env) -> None:
 def _quiet_construction() -> Iterator[None]:
     # The paper's tasks are the -v4 ones on purpose, their XML files predate MuJoCo 3, and the
     # networks take float32: none of these notices helps. Everything else is still shown.
-    mujoco = import_mujoco()
     previous = getattr(mujoco, "get_mju_user_warning", lambda: None)()  # new in MuJoCo 4
 
     def show(message: str) -> None:

@@ -1,4 +1,4 @@
-"""Replay buffer and its state, episode sums, NaN checks."""
+"""Rows, the replay buffer and its state."""
 
 from __future__ import annotations
 
@@ -6,14 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_aca.training.data import (
-    BufferState,
-    EpisodeTracker,
-    check_finite,
-    make_replay_buffer,
-    transitions,
-)
-from torchrl_aca.errors import RunError
+from torchrl_aca.replay import BufferState, make_replay_buffer, transitions
 
 
 def collected(num_envs: int = 5, steps: int = 1, observation_dim: int = 17, action_dim: int = 6):
@@ -42,6 +35,17 @@ def test_transitions_are_flat_and_hold_only_what_learning_needs():
     flat = transitions(collected(num_envs=3, steps=2))
     assert flat.batch_size == (6,)
     assert "loc" not in flat.keys(True) and ("next", "truncated") not in flat.keys(True)
+
+
+def test_a_method_keeps_keys_of_its_own():
+    data = collected(num_envs=3, steps=2)
+    data["next", "value"] = torch.rand(3, 2, 1)
+    flat = transitions(data, ["loc", ("next", "value")])
+    assert flat.batch_size == (6,)
+    assert torch.equal(flat["next", "value"], data["next", "value"].flatten(0, 1))
+    assert flat["loc"].shape == (6, 6) and ("next", "reward") in flat.keys(True)
+    with pytest.raises(KeyError, match="mc_return"):
+        transitions(data, ["mc_return"])
 
 
 @pytest.mark.parametrize("rows", [7, 20, 33])
@@ -77,31 +81,11 @@ def test_a_million_half_cheetah_transitions_stay_below_one_gibibyte():
     assert 100 * size < 2**30
 
 
-def test_episode_tracker_sums_per_environment_and_restores():
-    tracker, other = EpisodeTracker(2), EpisodeTracker(2)
-    data = collected(num_envs=2, steps=4)
-    data["next", "reward"] = torch.tensor([[1.0, 1, 1, 1], [2, 2, 2, 2]]).unsqueeze(-1)
-    data["next", "done"][0, 1] = True
-    tracker.add(data)
-    assert tracker.metrics() == {
-        "train_episodes": 1.0,
-        "train_return": 2.0,
-        "train_episode_length": 2.0,
-    }
-    other.load_state_dict(tracker.state_dict())
-    data["next", "done"][:, 3] = True
-    for each in (tracker, other):
-        each.add(data)
-    assert tracker.metrics() == other.metrics()
-    assert list(tracker.latest) == [(2.0, 2), (4.0, 4), (2.0, 2), (16.0, 8)]
-
-
-@pytest.mark.parametrize("key", ["action", ("next", "reward"), ("next", "observation")])
-@pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_check_finite_names_environment_frames_and_key(key, value):
-    data = collected()
-    check_finite(data, "Toy-v0", 10)
-    data[key][2, 0, 0] = value
-    name = key if isinstance(key, str) else ".".join(key)
-    with pytest.raises(RunError, match=f"Toy-v0.*{name}.*after 10 frames"):
-        check_finite(data, "Toy-v0", 10)
+def test_state_holds_the_keys_that_are_asked_for():
+    keys = ("observation", ("next", "reward"), "loc")
+    buffer, other = (make_replay_buffer(capacity=20, batch_size=4) for _ in range(2))
+    buffer.extend(collected(num_envs=7).reshape(-1))
+    state = BufferState(buffer, keys).state_dict()
+    assert set(state["rows"]) == {"observation", "next.reward", "loc"}
+    BufferState(other, keys).load_state_dict(state)
+    assert torch.equal(other[:]["loc"], buffer[:]["loc"])

@@ -19,10 +19,9 @@ from torchrl.data import (
 )
 from torchrl.envs import RewardScaling
 
-from torchrl_aca.replay import MixedReplayBuffer
-from torchrl_aca.training.checkpoint import read_checkpoint, restore, save_checkpoint
-from torchrl_aca.training.data import transitions
 from torchrl_aca.errors import RunError
+from torchrl_aca.replay import MixedReplayBuffer, transitions
+from torchrl_aca.training.checkpoint import Counters, read_checkpoint, restore, save_checkpoint
 
 FLOAT64 = torch.float64
 
@@ -101,6 +100,18 @@ def test_without_a_half_that_no_row_comes_from():
     batch = only_online.sample(8)
     assert (numbers(batch) >= 1000).all()
     assert set(batch.keys(True, True)) == set(keys)
+
+
+def test_the_fraction_changes_between_two_phases():
+    buffer = mixture(online=0, offline_fraction=1, batch_size=10)
+    assert (numbers(buffer.sample()) < 20).all()
+    buffer.offline_fraction = 0.3
+    buffer.extend(rows(4, first=1000))
+    assert (numbers(buffer.sample()) < 20).sum() == 3 == buffer.num_offline(10)
+    for wrong in (-0.1, 1.1, float("nan")):
+        with pytest.raises(ValueError, match=r"offline_fraction in \[0, 1\], got"):
+            buffer.offline_fraction = wrong
+    assert buffer.offline_fraction == 0.3
 
 
 # --- draws ----------------------------------------------------------------------------------------
@@ -247,12 +258,22 @@ def test_a_mixture_is_a_part_of_a_run_checkpoint(tmp_path):
     buffer, other, foreign = mixture(seed=1), mixture(seed=2), mixture(offline=21)
     collected = rows(6, first=1000).reshape(3, 2)  # as a collector gives it: (num_envs, steps)
     buffer.extend(transitions(collected))
-    save_checkpoint(tmp_path / "checkpoints", {"buffer": buffer}, {}, updates=1, keep_last=1)
+    parts = {"buffer": buffer, "counters": Counters()}
+    save_checkpoint(tmp_path / "checkpoints", parts, {}, updates=1, keep_last=1)
     states = read_checkpoint(tmp_path)["parts"]
     restore({"buffer": other}, states)
     assert (buffer.sample() == other.sample()).all()
     with pytest.raises(RunError, match="another mixture"):
         restore({"buffer": foreign}, states)
+
+
+def test_the_fraction_is_a_part_of_the_state():
+    through, resumed = mixture(seed=1, offline_fraction=0.5), mixture(offline_fraction=0.5)
+    through.offline_fraction = 1
+    resumed.load_state_dict(through.state_dict())
+    assert resumed.offline_fraction == 1
+    assert (through.sample(8) == resumed.sample(8)).all()
+    assert (numbers(resumed.sample(8)) < 20).all()
 
 
 def test_offline_rows_are_identified_and_not_saved(tmp_path):
@@ -268,7 +289,6 @@ def test_offline_rows_are_identified_and_not_saved(tmp_path):
         ("dtype", "expected offline fingerprint"),
         ("keys", "expected keys .* got .'observation'"),
         ("capacity", "expected online capacity 100, got 50"),
-        ("fraction", "expected offline_fraction 1/2, got 1/4"),
         ("batch", "expected batch_size 256, got 64"),
     ],
 )
@@ -281,8 +301,9 @@ def test_the_state_of_another_mixture_is_refused_and_nothing_changes(change, mes
         offline["action"] = offline["action"].half()
     keys = ["observation", ("next", "reward")] if change == "keys" else None
     online = online_buffer(capacity=50 if change == "capacity" else 100)
-    shares = {"fraction": {"offline_fraction": 0.25}, "batch": {"batch_size": 64}}.get(change, {})
-    other = MixedReplayBuffer(offline, online, keys=keys, **shares)
+    other = MixedReplayBuffer(
+        offline, online, keys=keys, batch_size=64 if change == "batch" else 256
+    )
     with pytest.raises(ValueError, match=f"another mixture: {message}"):
         other.load_state_dict(state)
     assert len(other.online) == 0
