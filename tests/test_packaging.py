@@ -25,16 +25,33 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 # What each module of the core may import from the package.
 ALLOWED = {
     "functional": set(),
-    "schedule": {"functional"},
     "checks": set(),
-    "critic": {"functional"},
+    "errors": set(),
+    "schedule": {"checks", "functional"},
+    "chain": {"checks", "functional", "schedule"},
+    "critic": {"checks", "functional"},
     "custom_critic": {"functional", "critic"},
-    "actor": {"checks", "functional", "schedule", "critic", "custom_critic"},
-    "td_loss": set(),
-    "loss": {"functional", "schedule", "critic", "custom_critic", "actor", "td_loss"},
+    "actor": {"checks", "functional", "schedule", "chain", "critic", "custom_critic"},
+    "td_loss": {"checks"},
+    "loss": {
+        "checks",
+        "functional",
+        "schedule",
+        "chain",
+        "critic",
+        "custom_critic",
+        "actor",
+        "td_loss",
+    },
     "interop": {"functional", "critic"},
 }
-BASELINES_MAY_IMPORT = {"baselines", "functional", "schedule", "td_loss", "training"}
+# What each room may import besides itself.
+ROOMS = {
+    "baselines": {"checks", "functional", "schedule", "chain", "td_loss"},
+    "replay": {"checks", "errors"},
+    "offline": {"checks", "errors", "replay"},
+    "training": {"checks", "errors", "replay"},
+}
 OPTIONAL = [
     "gymnasium",
     "h5py",
@@ -43,6 +60,7 @@ OPTIONAL = [
     "matplotlib",
     "minari",
     "omegaconf",
+    "pydantic",
     "ray",
     "tensorboard",
     "tqdm",
@@ -64,7 +82,7 @@ PathFinder.find_spec = find_installed
 try:
     import gymnasium
 except ModuleNotFoundError:
-    import {PACKAGE}, {PACKAGE}.baselines, {PACKAGE}.offline
+    import {PACKAGE}, {PACKAGE}.baselines, {PACKAGE}.offline, {PACKAGE}.replay
     assert {PACKAGE}.__all__
 else:
     sys.exit("the extras were not hidden")
@@ -107,28 +125,33 @@ def test_every_core_file_has_a_rule() -> None:
     assert files == {*ALLOWED, "__init__"}
 
 
-def test_training_knows_no_algorithm() -> None:
-    files = sorted((ROOT / PACKAGE / "training").rglob("*.py"))
-    assert files
+@pytest.mark.parametrize("room", ROOMS)
+def test_rooms_stand_where_the_design_has_them(room: str) -> None:
+    files = sorted((ROOT / PACKAGE / room).rglob("*.py"))
+    assert len(files) > 1
     for path in files:
-        assert imported_parts(path) <= {"training"}, path.name
+        assert imported_parts(path) <= ROOMS[room] | {room}, path.name
 
 
-def test_offline_data_know_no_algorithm() -> None:
-    files = sorted((ROOT / PACKAGE / "offline").rglob("*.py"))
-    assert files
-    for path in files:
-        assert imported_parts(path) <= {"offline", "training", "checks"}, path.name
+def test_every_room_has_a_rule() -> None:
+    rooms = {path.name for path in (ROOT / PACKAGE).iterdir() if (path / "__init__.py").exists()}
+    assert rooms == set(ROOMS)
 
 
-def test_baselines_stand_beside_aca() -> None:
-    """They share its equations, the base of its loss and training's seam, not critic or actor."""
-    files = sorted((ROOT / PACKAGE / "baselines").rglob("*.py"))
-    assert files
-    for path in files:
-        assert imported_parts(path) <= BASELINES_MAY_IMPORT, path
-        training = {name for name in imported_modules(path) if ".training." in name}
-        assert all(".training.agent." in name for name in training), path
+def test_no_script_imports_a_script() -> None:
+    scripts = {path.stem for path in (ROOT / "recipes").glob("*.py")} - {"renderer"}
+    assert len(scripts) > 4
+    for path in (ROOT / "recipes").rglob("*.py"):
+        imported = {name.split(".")[0] for name in imported_modules(path)}
+        assert not imported & scripts, path
+
+
+def test_nothing_patches_the_search_path() -> None:
+    here = Path(__file__)
+    for folder in ("tests", "benchmarks", "recipes"):
+        for path in (ROOT / folder).rglob("*.py"):
+            if path != here:
+                assert not re.search(r"sys\.path|syspath", path.read_text()), path
 
 
 def test_package_never_imports_recipes() -> None:

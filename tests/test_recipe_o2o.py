@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import re
 import shutil
 from pathlib import Path
@@ -12,20 +11,20 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
+
+import o2o_halfcheetah
 from recipe_cases import (
     CONFIGS,
-    RECIPES,
     assert_same_state,
     composed,
     rows_of,
     run,
     without_time,
 )
-
+from torchrl_aca.errors import RunError
 from torchrl_aca.offline import DatasetError, DatasetWriter
 from torchrl_aca.offline.layout import sha256
-from torchrl_aca.training.config import resumed_config
-from torchrl_aca.errors import RunError
+from torchrl_aca.training.resume import resumed_config
 
 SIZES = {"observation_dim": 11, "action_dim": 3}  # Hopper's
 MARK = 1000.0  # below every offline reward, above every online one
@@ -33,7 +32,7 @@ TINY = [
     "env=hopper",
     "num_threads=1",
     "online_frames=60",
-    "collector.init_random_frames=50",
+    "collector.warmup_frames=50",
     "buffer.capacity=300",
     "optim.batch_size=16",
     "eval.interval=30",
@@ -81,24 +80,15 @@ def data(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def recipes():
-    """The recipes' modules, by name."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(RECIPES))
-        yield importlib.import_module
-
-
-@pytest.fixture(scope="module")
-def train(recipes):
+def train():
     """The recipe without a process of its own: takes overrides, as the command does."""
 
     def trainer(*overrides: str, name: str = "o2o_halfcheetah") -> Path:
         with initialize_config_dir(str(CONFIGS), version_base="1.3"):
             cfg = compose(name, list(overrides))
-            module = recipes("o2o_halfcheetah")
             if cfg.resume is None:
-                return module.train(cfg)
-            return module.train(*resumed_config(cfg, overrides))
+                return o2o_halfcheetah.train(cfg)
+            return o2o_halfcheetah.train(*resumed_config(cfg, overrides))
 
     return trainer
 
@@ -300,7 +290,7 @@ def test_the_quickstart_makes_its_data_and_is_short():
         (["offline_fraction=-0.1"], "offline_fraction=-0.1: expected a share"),
         (["offline_fraction=true"], "offline_fraction=True: expected a share"),
         (["dataset=123"], "dataset=123: expected the directory of a data set"),
-        (["collector.init_random_frames=some"], "init_random_frames='some': expected a positive"),
+        (["collector.warmup_frames=some"], "warmup_frames='some': expected a positive"),
         (["optim.utd_ratio=null"], "optim.utd_ratio=None: expected a number above 0"),
         (["utd=true"], "utd=True: expected a number above 0"),
         (["utd=inf"], "utd=inf: expected a number above 0"),

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import signal
-import sys
 import time
 from pathlib import Path
 
@@ -15,9 +15,13 @@ import pytest
 import torch
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
+
+from agents import configured
+from online_mujoco import train
 from recipe_cases import (
     CONFIGS,
     RECIPES,
+    TINY,
     assert_same_state,
     checkpoint_leaves,
     composed,
@@ -26,61 +30,20 @@ from recipe_cases import (
     start,
     without_time,
 )
-
-from torchrl_aca.training.checkpoint import list_checkpoints
-from torchrl_aca.training.config import resumed_config
-from torchrl_aca.training.envs import make_env
 from torchrl_aca.errors import RunError
+from torchrl_aca.training.checkpoint import list_checkpoints
+from torchrl_aca.training.envs import make_env
+from torchrl_aca.training.resume import resumed_config
+from torchrl_aca.training.run import updates_due
 
 SCRIPT = RECIPES / "online_mujoco.py"
-TINY_RUN = [
-    "env=hopper",
-    "num_threads=1",
-    "collector.init_random_frames=200",
-    "buffer.capacity=300",
-    "optim.batch_size=16",
-    "optim.total_updates=60",
-    "eval.interval=30",
-    "eval.episodes=2",
-    "checkpoint.interval=25",
-    "logger.interval=10",
-]
-TINY = ["algo=sac", "sac.num_cells=[16,16]", *TINY_RUN]
-TINY_ACA = [
-    "algo=aca",
-    "aca.num_cells=[16,16]",
-    "aca.num_steps=3",
-    "aca.num_candidates=3",
-    "aca.num_target_candidates=2",
-    "aca.alpha_interval=20",
-    *TINY_RUN,
-]
-
-TINY_RLPD = [
-    "algo=rlpd",
-    "rlpd.num_cells=[16,16]",
-    "rlpd.num_qvalue_nets=3",
-    "rlpd.actor_interval=7",  # so that the run stops between two steps of the actor
-    *TINY_RUN,
-    "optim.utd_ratio=0.4",
-]
-
-
-@pytest.fixture(scope="module")
-def train():
-    """The recipe's own `train`, for what needs no process of its own."""
-    sys.path.insert(0, str(SCRIPT.parent))
-    try:
-        from online_mujoco import train as function
-    finally:
-        sys.path.remove(str(SCRIPT.parent))
-    return function
+TINY_SAC = TINY["sac"]
 
 
 @pytest.fixture(scope="module")
 def unbroken(tmp_path_factory) -> Path:
     cwd = tmp_path_factory.mktemp("unbroken")
-    code, output, errors = run(*TINY, cwd=cwd)
+    code, output, errors = run(*TINY_SAC, cwd=cwd)
     assert code == 0, errors
     (run_dir,) = (cwd / "runs").iterdir()
     (cwd / "output.txt").write_text(output)
@@ -133,41 +96,22 @@ def test_output_says_before_and_after_and_leaves_nothing_else(unbroken):
     assert {path.name for path in unbroken.parents[1].iterdir()} == {"runs", "output.txt"}
 
 
-def check_stop_and_resume(settings: list[str], unbroken: Path, tmp_path: Path) -> None:
-    code, _, errors = run(*settings, "optim.total_updates=34", "run_dir=here", cwd=tmp_path)
+def test_stop_and_resume_from_the_shell_equals_never_stopping(unbroken, tmp_path):
+    code, _, errors = run(*TINY_SAC, "optim.total_updates=34", "run_dir=here", cwd=tmp_path)
     assert code == 0, errors
     code, _, errors = run("resume=here", "optim.total_updates=60", cwd=tmp_path)
     assert code == 0, errors
     assert_same_state(unbroken, tmp_path / "here")
     assert without_time(unbroken / "metrics.csv") == without_time(tmp_path / "here" / "metrics.csv")
-    # The shorter run also evaluated at its own end.
-    evaluations = rows_of(tmp_path / "here" / "eval.csv")
-    assert [row for row in evaluations if row["updates"] != "34"] == rows_of(unbroken / "eval.csv")
-
-
-def test_stop_and_resume_equals_never_stopping(unbroken, tmp_path):
-    check_stop_and_resume(TINY, unbroken, tmp_path)
-
-
-def test_aca_stop_and_resume_equals_never_stopping(tmp_path):
-    code, _, errors = run(*TINY_ACA, "run_dir=unbroken", cwd=tmp_path)
-    assert code == 0, errors
-    check_stop_and_resume(TINY_ACA, tmp_path / "unbroken", tmp_path)
-
-
-@pytest.mark.parametrize("variant", ["rlpd", "wsrl"])
-def test_rlpd_stop_and_resume_equals_never_stopping(train, variant, tmp_path):
-    settings = [*TINY_RLPD, f"variant={variant}"]
-    unbroken = train(composed(*settings, f"run_dir={tmp_path / 'unbroken'}"))
-    train(composed(*settings, f"run_dir={tmp_path / 'here'}", "optim.total_updates=34"))
-    typed = [f"resume={tmp_path / 'here'}", "optim.total_updates=60"]
-    resumed = train(*resumed_config(composed("algo=rlpd", *typed), typed))
-    assert_same_state(unbroken, resumed)
-    assert without_time(unbroken / "metrics.csv") == without_time(resumed / "metrics.csv")
 
 
 def test_ctrl_c_leaves_a_checkpoint_that_resumes(unbroken, tmp_path):
-    arguments = [*TINY, "optim.total_updates=100000", "run_dir=here", "checkpoint.interval=100000"]
+    arguments = [
+        *TINY_SAC,
+        "optim.total_updates=100000",
+        "run_dir=here",
+        "checkpoint.interval=100000",
+    ]
     process = start(*arguments, cwd=tmp_path)
     deadline = time.time() + 60
     while not (tmp_path / "here" / "metrics.csv").exists() and time.time() < deadline:
@@ -184,89 +128,30 @@ def test_ctrl_c_leaves_a_checkpoint_that_resumes(unbroken, tmp_path):
     assert int(rows_of(tmp_path / "here" / "eval.csv")[-1]["updates"]) == stopped + 5
 
 
-def test_mistakes_are_told_in_one_message(tmp_path):
-    code, _, errors = run("env.name=CartPole-v1", *TINY, cwd=tmp_path)
-    assert code == 1 and errors.startswith("error: CartPole-v1 has the action space Discrete(2)")
-    assert "Traceback" not in errors
-    assert not (tmp_path / "runs").exists()
-    with pytest.raises(HydraException, match="batch_sise"):
-        composed("optim.batch_sise=3")
-
-
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["algo.name=dqn"], "algo.name='dqn'.*'sac'"),
-        (["env.name=Nowhere-v0"], "Nowhere-v0.*cannot be made"),
-        (["optim.batch_size=0"], "optim.batch_size=0: expected a positive integer"),
-        (["sac.num_cells=[0]"], "sac.num_cells.*positive integers"),
-        (["buffer.capacity=8"], "at least optim.batch_size"),
-        (["device=cuda:99"], "device=cuda:99"),
-    ],
-)
-def test_bad_configurations_are_refused_before_any_work(train, tmp_path, overrides, message):
-    cfg = composed(*TINY, f"run_dir={tmp_path / 'here'}", *overrides)
-    with pytest.raises(RunError, match=message):
-        train(cfg)
-    assert not (tmp_path / "here").exists()
-
-
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("aca.noise_level_interval=0", "noise_level_interval=0.*positive integer"),
-        ("aca.num_candidates=-1", "num_candidates=-1.*positive integer"),
-        ("optim.lr_end=0", "optim.lr_end=0: expected a number above 0"),
-        ("aca.schedule=steep", "aca.schedule=steep: expected one of.*cosine"),
-        ("matmul_precision=fast", "matmul_precision=.fast.: expected one of"),
-        ("aca.first_level=3", "cannot be built: first_level must be 0 or 1, got 3"),
-    ],
-)
-def test_bad_settings_of_aca_are_refused_before_any_work(train, tmp_path, override, message):
-    cfg = composed("algo=aca", "env=hopper", f"run_dir={tmp_path / 'here'}", override)
-    with pytest.raises(RunError, match=message):
-        train(cfg)
-    assert not (tmp_path / "here").exists()
-
-
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("optim.utd_ratio=0.5", "rlpd.actor_interval=0.5: expected a positive integer"),
-        ("optim.actor_lr=0", "optim.actor_lr=0: expected a number above 0"),
-        ("rlpd.subset_size=11", "cannot be built: subset_size must be from 1 to .*10.*, got 11"),
-        ("rlpd.init=zeros", "rlpd.init=zeros: expected one of.*orthogonal"),
-    ],
-)
-def test_bad_settings_of_rlpd_are_refused_before_any_work(train, tmp_path, override, message):
-    cfg = composed("algo=rlpd", "env=hopper", f"run_dir={tmp_path / 'here'}", override)
-    with pytest.raises(RunError, match=message):
-        train(cfg)
-    assert not (tmp_path / "here").exists()
-
-
-def test_a_variant_belongs_to_rlpd_and_stays_that_of_the_run(train, tmp_path):
+def test_a_variant_belongs_to_rlpd_and_stays_that_of_the_run(tmp_path):
     with pytest.raises(HydraException, match="variant"):
         composed("algo=sac", "variant=wsrl")
-    run_dir = train(composed(*TINY_RLPD, f"run_dir={tmp_path / 'here'}", "optim.total_updates=2"))
+    run_dir = train(
+        composed(*TINY["rlpd"], f"run_dir={tmp_path / 'here'}", "optim.total_updates=2")
+    )
     typed = [f"resume={run_dir}", "variant=wsrl"]
     with pytest.raises(RunError, match="variant.name=wsrl.*run to resume has variant.name=rlpd"):
         resumed_config(composed("algo=rlpd", *typed), typed)
 
 
-def test_wandb_without_login_is_refused(train, tmp_path, monkeypatch):
+def test_wandb_without_login_is_refused(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("NETRC", str(tmp_path / "netrc"))
     monkeypatch.delenv("WANDB_API_KEY", raising=False)
-    cfg = composed(*TINY, f"run_dir={tmp_path / 'here'}", "logger.backend=wandb")
+    cfg = composed(*TINY_SAC, f"run_dir={tmp_path / 'here'}", "logger.backend=wandb")
     with pytest.raises(RunError, match="wandb"):
         train(cfg)
     assert not (tmp_path / "here").exists()
 
 
-def test_a_used_run_directory_is_refused(train, unbroken):
+def test_a_used_run_directory_is_refused(unbroken):
     with pytest.raises(RunError, match="already holds a run"):
-        train(composed(*TINY, f"run_dir={unbroken}"))
+        train(composed(*TINY_SAC, f"run_dir={unbroken}"))
 
 
 @pytest.mark.parametrize(
@@ -278,7 +163,6 @@ def test_a_used_run_directory_is_refused(train, unbroken):
         ),
         (["env=ant"], "env.name=Ant-v4.*run to resume has env.name=Hopper-v4"),
         (["seed=4"], "seed=4.*run to resume has seed=0"),
-        (["optim.total_updates=60"], "already has 60 updates"),
     ],
 )
 def test_a_resume_that_changes_the_run_is_refused(unbroken, overrides, message):
@@ -287,18 +171,106 @@ def test_a_resume_that_changes_the_run_is_refused(unbroken, overrides, message):
         resumed_config(cfg, overrides)
 
 
+@pytest.mark.parametrize(
+    ("total", "message"),
+    [
+        ("60", "already has 60 updates"),
+        ("abc", "optim.total_updates='abc': expected a valid integer"),
+        ("null", "optim.total_updates=None: expected a valid integer"),
+    ],
+)
+def test_a_resume_needs_more_updates_to_make(unbroken, total, message):
+    typed = [f"resume={unbroken}", f"optim.total_updates={total}"]
+    with pytest.raises(RunError, match=message):
+        train(*resumed_config(composed("algo=sac", *typed), typed))
+
+
 def test_a_resume_with_an_edited_config_or_from_nowhere_is_refused(unbroken, tmp_path):
     cfg = composed("algo=sac", f"resume={tmp_path}")
-    with pytest.raises(RunError, match="found no config.yaml"):
-        resumed_config(cfg, [])
-    stored = OmegaConf.load(unbroken / "config.yaml")
-    stored.sac.num_cells = [8]
-    OmegaConf.save(stored, tmp_path / "config.yaml")
     with pytest.raises(RunError, match="found none"):
         resumed_config(cfg, [])
     (tmp_path / "checkpoints").symlink_to(unbroken / "checkpoints")
+    stored = OmegaConf.load(unbroken / "config.yaml")
+    stored.sac.num_cells = [8]
+    OmegaConf.save(stored, tmp_path / "config.yaml")
     with pytest.raises(RunError, match=r"config.yaml has sac.num_cells=\[8\]"):
         resumed_config(cfg, [])
+
+
+@pytest.mark.parametrize("content", [None, b"", b"\x00\xff\x80", b"!!python/object:os.system {}"])
+def test_a_lost_or_damaged_config_is_read_back_from_the_checkpoint(unbroken, tmp_path, content):
+    here = tmp_path / "here"
+    shutil.copytree(unbroken, here)
+    (here / "config.yaml").unlink()
+    (here / "versions.json").unlink()
+    if content is not None:
+        (here / "config.yaml").write_bytes(content)
+    typed = [f"resume={here}", "optim.total_updates=62"]
+    train(*resumed_config(composed("algo=sac", *typed), typed))
+    assert OmegaConf.load(here / "config.yaml").sac.num_cells == [16, 16]
+    assert "versions.json is missing or damaged" in (here / "card.md").read_text()
+
+
+def test_a_table_that_is_no_file_is_told(unbroken, tmp_path):
+    here = tmp_path / "here"
+    shutil.copytree(unbroken, here)
+    (here / "eval.csv").unlink()
+    (here / "eval.csv").mkdir()
+    typed = [f"resume={here}", "optim.total_updates=62"]
+    with pytest.raises(RunError, match="cannot be written.*eval.csv"):
+        train(*resumed_config(composed("algo=sac", *typed), typed))
+
+
+DAMAGE = {
+    "config": lambda content: content.pop("config"),
+    "no parts": lambda content: content.pop("parts"),
+    "parts is a list": lambda content: content.update(parts=[1]),
+    "counters is None": lambda content: content["parts"].update(counters=None),
+    "loss is None": lambda content: content["parts"].update({"agent.loss": None}),
+    "buffer is None": lambda content: content["parts"].update(buffer=None),
+    "wide rows": lambda content: content["parts"]["buffer"]["rows"].update(
+        observation=torch.zeros(300, 99)
+    ),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE)
+def test_a_checkpoint_of_another_form_is_told_in_one_message(unbroken, tmp_path, damage):
+    here = tmp_path / "here"
+    shutil.copytree(unbroken, here)
+    path = list_checkpoints(here / "checkpoints")[-1]
+    content = torch.load(path, weights_only=True)
+    damage(content)
+    torch.save(content, path)
+    typed = [f"resume={here}", "optim.total_updates=62"]
+    with pytest.raises(RunError, match="checkpoint"):
+        train(*resumed_config(composed("algo=sac", *typed), typed))
+
+
+def test_a_run_killed_before_its_first_checkpoint_is_started_again_by_its_command(tmp_path):
+    arguments = [*TINY_SAC, "run_dir=here", "checkpoint.interval=100000"]
+    process = start(*arguments, "optim.total_updates=100000", cwd=tmp_path)
+    deadline = time.time() + 60
+    while not (tmp_path / "here" / "eval.csv").exists() and time.time() < deadline:
+        time.sleep(0.02)
+    process.kill()
+    process.communicate()
+    assert (tmp_path / "here" / "config.yaml").exists()
+    code, _, errors = run(*TINY_SAC, "run_dir=here", cwd=tmp_path)
+    assert code == 0, errors
+    assert [row["updates"] for row in rows_of(tmp_path / "here" / "eval.csv")] == ["0", "30", "60"]
+
+
+def test_multirun_names_its_jobs_by_their_overrides(tmp_path):
+    sweep = ["--multirun", "seed=0,1", "optim.total_updates=2", "hydra.sweep.dir=sweep"]
+    code, _, errors = run(*TINY_SAC, *sweep, cwd=tmp_path)
+    assert code == 0, errors
+    jobs = sorted(path for path in (tmp_path / "sweep").iterdir() if path.is_dir())
+    assert len(jobs) == 2
+    for seed, job in enumerate(jobs):
+        assert f"seed={seed}" in job.name
+        assert OmegaConf.load(job / "config.yaml").seed == seed
+        assert list_checkpoints(job / "checkpoints")
 
 
 def test_total_updates_and_logger_may_change_on_resume(unbroken):
@@ -325,11 +297,11 @@ class Failing(gym.Env):
         return np.zeros(3, np.float32), reward, self.steps % 10 == 0, False, {}
 
 
-def test_nan_rewards_stop_the_run_with_a_checkpoint_that_resumes(train, tmp_path):
-    gym.register("Failing-v0", Failing)
+def test_nan_rewards_stop_the_run_with_a_checkpoint_that_resumes(tmp_path):
+    gym.register("Failing-v0", Failing, max_episode_steps=100)
     try:
         run_dir = tmp_path / "here"
-        cfg = composed(*TINY, "env.name=Failing-v0", f"run_dir={run_dir}")
+        cfg = composed(*TINY_SAC, "env.name=Failing-v0", f"run_dir={run_dir}")
         with pytest.raises(RunError, match=r"Failing-v0.*next.reward.*after 495 frames.*0059.pt"):
             train(cfg)
         assert len(checkpoint_leaves(run_dir)) > 50
@@ -340,9 +312,7 @@ def test_nan_rewards_stop_the_run_with_a_checkpoint_that_resumes(train, tmp_path
         del gym.registry["Failing-v0"]
 
 
-def test_updates_per_frame_are_exact(train):
-    updates_due = sys.modules["online_mujoco"].updates_due
-    cfg = composed("collector.init_random_frames=1000")
+def test_updates_per_frame_are_exact():
     for ratio, frames, expected in [
         (0.2, 1000, 0),
         (0.2, 1005, 1),
@@ -351,24 +321,24 @@ def test_updates_per_frame_are_exact(train):
         (1, 1005, 5),
         (0.2, 500, 0),
     ]:
-        cfg.optim.utd_ratio = ratio
+        cfg = configured(composed("collector.warmup_frames=1000", f"optim.utd_ratio={ratio}"))
         assert updates_due(cfg, frames) == expected
 
 
 def test_wandb_offline(tmp_path):
     overrides = ["run_dir=here", "logger.backend=wandb", "logger.wandb_mode=offline"]
-    code, _, errors = run(*TINY, *overrides, cwd=tmp_path)
+    code, _, errors = run(*TINY_SAC, *overrides, cwd=tmp_path)
     assert code == 0, errors
     (path,) = (tmp_path / "here").glob("wandb/offline-run-*/*.wandb")
     assert b"metrics/loss_qvalue" in path.read_bytes()
     assert len(rows_of(tmp_path / "here" / "metrics.csv")) == 6
 
 
-def test_tensorboard_and_video(train, tmp_path):
+def test_tensorboard_and_video(tmp_path):
     run_dir = tmp_path / "here"
     overrides = [f"run_dir={run_dir}", "logger.backend=tensorboard", "video.enabled=true"]
     try:
-        train(composed(*TINY, *overrides))
+        train(composed(*TINY_SAC, *overrides))
         assert (run_dir / "video.mp4").stat().st_size > 1000
     except RunError as error:
         if "could not be rendered" not in str(error):
@@ -379,10 +349,9 @@ def test_tensorboard_and_video(train, tmp_path):
         assert b"metrics/loss_qvalue" in path.read_bytes()
 
 
-def test_every_configuration_composes_and_its_environment_is_built():
+def test_every_task_is_built_and_has_the_sizes_that_its_file_says():
     tasks = sorted(path.stem for path in (CONFIGS / "env").glob("*.yaml"))
-    algorithms = sorted(path.stem for path in (CONFIGS / "algo").glob("*.yaml"))
-    assert len(tasks) == 10 and {"aca", "rlpd", "sac"} <= set(algorithms)
+    assert len(tasks) == 10
     for task in tasks:
         cfg = composed(f"env={task}")
         observation, _ = make_env(cfg.env.name).reset(seed=0)
@@ -391,9 +360,6 @@ def test_every_configuration_composes_and_its_environment_is_built():
         sizes = re.search(r"(\d+) observations, (\d+) action", header)
         assert observation.shape == (int(sizes[1]),)
         assert make_env(cfg.env.name).action_space.shape == (int(sizes[2]),)
-    for algorithm in algorithms:
-        assert composed(f"algo={algorithm}").algo.name == algorithm
-    assert composed(name="quickstart").algo.name == "aca"
 
 
 def test_humanoid_settings_win_over_the_algorithm_and_quickstart_over_both():

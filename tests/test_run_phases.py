@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from recipe_cases import assert_same_state, rows_of, without_time
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
+from recipe_cases import assert_same_state, rows_of, without_time
 from torchrl_aca.errors import RunError
 from torchrl_aca.replay import TRANSITION_KEYS, MixedReplayBuffer, make_replay_buffer, transitions
 from torchrl_aca.training.agent import Agent
@@ -154,9 +154,9 @@ def train(run_dir: Path, *, warmup="random", stop=None, resume=False, changes=No
             step("offline", run.counters.offline_updates + 1)
         buffer.offline_fraction = 0.5
         for data in collection:
-            drawn = "draw" in data.keys() and bool((data["draw"] > 0).any())
+            drawn = data.get("draw", None) is not None and bool((data["draw"] > 0).any())
             step("policy" if drawn else "random", collection.frames)
-            if "draw" not in data.keys():
+            if data.get("draw", None) is None:
                 data["draw"] = torch.zeros_like(data["action"])
             buffer.extend(transitions(data, agent.extra_keys))
             for batch in run.due(buffer):

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import importlib
 import warnings
 
 import pytest
 import torch
 import torch._inductor.config
-from recipe_cases import RECIPES, composed
 from tensordict import TensorDict
 
+from agents import configured, make_agent
+from online_mujoco import train
+from recipe_cases import composed
+from torchrl_aca.errors import RunError
 from torchrl_aca.training.acceleration import capture, compiled, make_adam
 from torchrl_aca.training.envs import make_vector_env
-from torchrl_aca.errors import RunError
 
 TINY = [
     "env=inverted_pendulum",
@@ -24,14 +25,6 @@ TINY = [
     "aca.num_target_candidates=2",
     "aca.alpha_interval=2",
 ]
-
-
-@pytest.fixture(scope="module")
-def recipes():
-    """The recipes' modules, by name."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(RECIPES))
-        yield importlib.import_module
 
 
 without_cuda = pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU captures these steps")
@@ -54,44 +47,40 @@ def batch_of(seed: int, size: int = 16) -> TensorDict:
     )
 
 
-def updated(recipes, *overrides: str, updates: int = 5):
+def updated(*overrides: str, updates: int = 5):
     """The metrics of a fresh ACA agent's first updates, and its state afterwards."""
-    cfg = composed(*TINY, *overrides)
+    cfg = configured(composed(*TINY, *overrides))
     env = make_vector_env(cfg.env.name, 1, 0)
     torch.manual_seed(0)
-    agent = recipes("agents").AGENTS["aca"](cfg, env, torch.device("cpu"))
+    agent = make_agent(cfg, env, torch.device("cpu"))
     torch.manual_seed(1)
     metrics = [agent.update(batch_of(number)).to_dict() for number in range(updates)]
     return metrics, agent.state["loss"].state_dict()
 
 
 def test_without_the_switches_functions_stay_what_they_are():
-    cfg = composed()
-
     def step(batch):
         return batch
 
-    assert capture(step, cfg) is step
-    assert compiled(step, cfg) is step
+    assert capture(step, False) is step
+    assert compiled(step, False) is step
 
 
 @without_cuda
 def test_without_cuda_a_captured_step_runs_as_it_is():
     with pytest.warns(UserWarning, match="(?i)cuda"):
-        step = capture(
-            lambda batch: batch.apply(lambda value: 2 * value), composed("cudagraphs=true")
-        )
+        step = capture(lambda batch: batch.apply(lambda value: 2 * value), True)
     for number in range(10):  # more than the warm-up
         batch = TensorDict(value=torch.full((3,), float(number)), batch_size=[3])
         assert torch.equal(step(batch)["value"], torch.full((3,), 2.0 * number))
 
 
 @without_cuda
-def test_cudagraphs_on_a_cpu_change_no_update(recipes):
-    plain, plain_state = updated(recipes)
+def test_cudagraphs_on_a_cpu_change_no_update():
+    plain, plain_state = updated()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        captured, captured_state = updated(recipes, "cudagraphs=true")
+        captured, captured_state = updated("cudagraphs=true")
     assert [sorted(each) for each in plain] == [sorted(each) for each in captured]
     for one, two in zip(plain, captured, strict=True):
         assert all(torch.equal(one[name], two[name]) for name in one)
@@ -99,20 +88,20 @@ def test_cudagraphs_on_a_cpu_change_no_update(recipes):
         assert torch.equal(value, captured_state[name]), name
 
 
-def test_the_recipe_refuses_cudagraphs_on_a_cpu(recipes, tmp_path):
+def test_the_recipe_refuses_cudagraphs_on_a_cpu(tmp_path):
     cfg = composed(*TINY, "cudagraphs=true", f"run_dir={tmp_path / 'here'}")
     with pytest.raises(RunError, match="cudagraphs=true: expected device=cuda, got cpu"):
-        recipes("online_mujoco").train(cfg)
+        train(cfg)
     assert not (tmp_path / "here").exists()
 
 
 @pytest.mark.slow
-def test_compiled_losses_are_those_of_plain_ones(recipes, tmp_path, monkeypatch):
+def test_compiled_losses_are_those_of_plain_ones(tmp_path, monkeypatch):
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))
-    plain, _ = updated(recipes, updates=3)
+    plain, _ = updated(updates=3)
     # Compiled code has random numbers of its own, unless it is told to draw torch's.
     with torch._inductor.config.patch(fallback_random=True):
-        quick, _ = updated(recipes, "compile=true", updates=3)
+        quick, _ = updated("compile=true", updates=3)
     for one, two in zip(plain, quick, strict=True):
         assert one.keys() == two.keys()
         for name in one:
@@ -122,7 +111,7 @@ def test_compiled_losses_are_those_of_plain_ones(recipes, tmp_path, monkeypatch)
 def test_adam_steps_as_the_formula_says():
     """Two steps of Kingma and Ba's algorithm 1, on one number, in floats of Python."""
     parameter = torch.nn.Parameter(torch.tensor([1.0]))
-    optimizer = make_adam([parameter], 0.1, composed())
+    optimizer = make_adam([parameter], 0.1, cudagraphs=False)
     value, first, second = 1.0, 0.0, 0.0
     for step, gradient in enumerate((0.5, -2.0), start=1):
         parameter.grad = torch.tensor([gradient])

@@ -9,13 +9,13 @@ import torch
 from torchrl.collectors import Collector
 from torchrl.modules import RandomPolicy
 
+from torchrl_aca.errors import RunError
 from torchrl_aca.training.envs import (
     EnvState,
     _quiet_construction,
     make_env,
     make_vector_env,
 )
-from torchrl_aca.errors import RunError
 
 
 def bare_env(name: str, seed: int) -> gym.Env:

@@ -9,8 +9,10 @@ import torch
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import RandomPolicy
 
+from torchrl_aca.errors import RunError
+from torchrl_aca.training.config import Eval
 from torchrl_aca.training.envs import make_vector_env
-from torchrl_aca.training.evaluation import evaluate
+from torchrl_aca.training.evaluation import evaluate, make_eval_env
 
 CPU = torch.device("cpu")
 
@@ -77,3 +79,15 @@ def test_policy_runs_deterministically_without_gradients(countdown):
 
     evaluate(policy, countdown, seed=0, device=CPU)
     assert torch.is_grad_enabled()
+
+
+def test_an_environment_without_a_time_limit_needs_one_for_its_evaluation(countdown):
+    settings = Eval(
+        interval=1, episodes=2, seed=0, random=False, draws="fresh", max_steps=None,
+        stop_return=None,
+    )  # fmt: skip
+    with pytest.raises(RunError, match="Countdown-v0 has no time limit.*eval.max_steps=1000"):
+        make_eval_env("Countdown-v0", settings)
+    env = make_eval_env("Countdown-v0", settings.model_copy(update={"max_steps": 2}))
+    result = evaluate(RandomPolicy(env.action_spec), env, seed=5, device=CPU)
+    assert result["episode_length"] == 2.0

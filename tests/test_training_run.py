@@ -8,9 +8,9 @@ import signal
 
 import pytest
 import torch
-from omegaconf import OmegaConf
 from tensordict import TensorDict
 
+from torchrl_aca.errors import RunError
 from torchrl_aca.training import checkpoint as checkpoint_module
 from torchrl_aca.training.checkpoint import (
     Counters,
@@ -19,11 +19,12 @@ from torchrl_aca.training.checkpoint import (
     restore,
     save_checkpoint,
 )
-from torchrl_aca.training.config import validate
-from torchrl_aca.errors import RunError
+from torchrl_aca.training.files import replace_file, write_text
 from torchrl_aca.training.logging import CsvTable, MetricMeans, ProgressBar
 from torchrl_aca.training.randomness import RandomState, seed_everything
-from torchrl_aca.training.run import Run, StopSignal, has_reached
+from torchrl_aca.training.run import has_reached, passed
+from torchrl_aca.training.run_dir import lock, make_run_dir, require_newest
+from torchrl_aca.training.signals import StopSignal
 
 
 def rows_of(path):
@@ -81,7 +82,6 @@ def test_restore_names_the_part_that_does_not_fit():
         restore({"net": torch.nn.Linear(3, 2)}, states)
     with pytest.raises(RunError, match="no \\['other'\\]"):
         restore({"other": torch.nn.Linear(2, 2)}, states)
-    restore({"other": torch.nn.Linear(2, 2)}, states, optional=("other",))
 
 
 def test_random_streams_are_restored(tmp_path):
@@ -111,7 +111,7 @@ def test_csv_table_takes_late_columns_and_forgets_rows_after_a_checkpoint(tmp_pa
         {"updates": "2", "a": "0.25", "b": "3"},
         {"updates": "3", "a": "", "b": "4"},
     ]
-    CsvTable(tmp_path / "t.csv", last_update=2).append({"updates": 7, "a": 1})
+    CsvTable(tmp_path / "t.csv", {"updates": 2}).append({"updates": 7, "a": 1})
     assert [row["updates"] for row in rows_of(tmp_path / "t.csv")] == ["1", "2", "7"]
 
 
@@ -139,70 +139,16 @@ def test_first_signal_asks_to_stop_and_handlers_are_put_back(number):
     assert signal.getsignal(number) is before
 
 
-def test_counters_tell_when_an_interval_has_passed():
-    counters = Counters(updates=10)
-    assert counters.passed(5, since=9) and counters.passed(10, since=9)
-    assert not counters.passed(5, since=10) and not counters.passed(11, since=0)
-    assert counters.passed(4, since=7)  # 8 lies in between
+def test_an_interval_has_passed_when_a_multiple_lies_between():
+    assert passed(5, 9, 10) and passed(10, 9, 10)
+    assert not passed(5, 10, 10) and not passed(11, 0, 10)
+    assert passed(4, 7, 10)  # 8 lies in between
 
 
 def test_plain_lines_where_there_is_no_terminal(capsys):
     bar = ProgressBar(total=10, initial=0)
     bar.show_metrics(5, 25, {"loss": 0.5, "alpha": 3.0})
     assert capsys.readouterr().out == "updates 5/10  frames 25  loss 0.5\n"
-
-
-def settings(tmp_path, **changes):
-    sections = {
-        "optim": {"total_updates": 100},
-        "collector": {"init_random_frames": 0},
-        "eval": {"interval": 10, "stop_return": None},
-        "checkpoint": {"interval": 20, "keep_last": 9},
-        "logger": {"interval": 5, "backend": "csv"},
-    }
-    for key, value in changes.items():
-        section, name = key.split("__")
-        sections[section][name] = value
-    named = {"algo": {"name": "a"}, "env": {"name": "Toy-v0"}, "seed": 0, "resume": None}
-    return OmegaConf.create({**named, **sections, "run_dir": str(tmp_path / "run")})
-
-
-def iterate(cfg, returns, updates_per_iteration=5):
-    """Ends iterations until a run is over: its updates, and the rows of its two tables."""
-    counters, returns = Counters(frames=1), iter(returns)
-
-    def evaluation():
-        zeros = {"return_std": 0.0, "num_episodes": 1.0, "episode_length": 1.0}
-        return {"return_mean": float(next(returns)), **zeros}
-
-    with Run(cfg, {"counters": counters}, counters, False, "recipe.py") as run:
-        last = False
-        while not last:
-            start = counters.updates
-            counters.updates += updates_per_iteration
-            counters.frames += 1
-            last = run.end_iteration(start, lambda: {"loss": 0.5}, evaluation)
-        run.finish(completed=True)
-    return counters.updates, rows_of(run.dir / "metrics.csv"), rows_of(run.dir / "eval.csv")
-
-
-def test_an_iteration_logs_evaluates_and_saves_what_is_due(tmp_path):
-    cfg = settings(tmp_path, optim__total_updates=45)
-    updates, metrics, evaluations = iterate(cfg, range(10))
-    assert updates == 45
-    assert [row["updates"] for row in metrics] == [str(5 * n) for n in range(1, 10)]
-    # Every tenth update, and the last one.
-    assert [row["updates"] for row in evaluations] == ["10", "20", "30", "40", "45"]
-    saved = [path.stem[-2:] for path in list_checkpoints(tmp_path / "run" / "checkpoints")]
-    assert saved == ["20", "40", "45"]
-
-
-def test_a_run_stops_when_two_evaluations_have_averaged_the_return(tmp_path):
-    cfg = settings(tmp_path, eval__stop_return=50)
-    # 90 alone is luck; (90 + 5) / 2 and (5 + 94) / 2 are too little; (94 + 6) / 2 is enough.
-    updates, _, evaluations = iterate(cfg, [0, 90, 5, 94, 6, 1000])
-    assert updates == 50
-    assert [float(row["return_mean"]) for row in evaluations] == [0, 90, 5, 94, 6]
 
 
 def test_one_evaluation_or_no_return_to_reach_never_stops_a_run():
@@ -213,83 +159,80 @@ def test_one_evaluation_or_no_return_to_reach_never_stops_a_run():
     assert not has_reached(rows, None)
 
 
-def test_a_run_belongs_to_one_process_until_it_ends(tmp_path):
-    cfg, counters = settings(tmp_path), Counters(frames=1)
-    cfg.resume = str(tmp_path / "run")
-    with Run(settings(tmp_path), {"counters": counters}, counters, False, "recipe.py") as first:
-        first.save()
-        with pytest.raises(RunError, match="run: another process is at work on this run"):
-            Run(cfg, {"counters": counters}, counters, True, "recipe.py")
-    with Run(cfg, {"counters": counters}, counters, True, "recipe.py") as run:
-        assert run.dir == tmp_path / "run"
-        counters.updates = 5
-        run.save()
+def test_two_runs_of_the_same_second_have_two_directories(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("torchrl_aca.training.run_dir.time.strftime", lambda _: "now")
+    names = [make_run_dir(None, "Hopper-v4-sac-s0").name for _ in range(3)]
+    assert names == ["Hopper-v4-sac-s0-now", "Hopper-v4-sac-s0-now-2", "Hopper-v4-sac-s0-now-3"]
+
+
+def test_a_run_directory_belongs_to_one_process_until_it_ends(tmp_path):
+    first = lock(tmp_path)
+    with pytest.raises(RunError, match="another process is at work on this run"):
+        lock(tmp_path)
+    first.release()
+    lock(tmp_path).release()
+
+
+def test_a_checkpoint_that_has_come_meanwhile_is_told(tmp_path):
+    save_checkpoint(tmp_path / "checkpoints", {"counters": Counters(5)}, {}, 5, keep_last=1)
+    require_newest(tmp_path, 5)
     with pytest.raises(RunError, match=r"went on to .*0005.pt while its checkpoint of 0 updates"):
-        Run(cfg, {}, Counters(), True, "recipe.py")
-    with Run(cfg, {}, counters, True, "recipe.py"):
-        pass  # the refusal has let go of the directory
+        require_newest(tmp_path, 0)
 
 
-def test_a_stopped_run_names_the_recipe_that_goes_on_with_it(tmp_path, capsys):
-    counters = Counters(updates=3, frames=3)
-    with Run(settings(tmp_path), {"counters": counters}, counters, False, "recipe.py") as run:
+@pytest.mark.parametrize("place", [0.3, 0.5, 0.9])
+def test_one_flipped_bit_is_found_and_the_checkpoint_before_offered(tmp_path, place):
+    parts = {"counters": Counters(1), "net": torch.nn.Linear(200, 200)}
+    for updates in (1, 2):
+        save_checkpoint(tmp_path / "checkpoints", parts, {}, updates, keep_last=2)
+    newest = list_checkpoints(tmp_path / "checkpoints")[-1]
+    content = bytearray(newest.read_bytes())
+    content[int(place * len(content))] ^= 1
+    newest.write_bytes(content)
+    with pytest.raises(RunError, match=r"0002.pt (is damaged|cannot be read).*0001.pt is intact"):
+        read_checkpoint(tmp_path)
+    newest.unlink()
+    assert read_checkpoint(tmp_path)["parts"]["counters"]["updates"] == 1
+
+
+def test_a_full_disk_leaves_the_file_that_was_there(tmp_path):
+    path = tmp_path / "eval.csv"
+    write_text(path, "old")
+
+    def crash(file):
+        file.write(b"half")
+        raise OSError("disk full")
+
+    with pytest.raises(OSError, match="disk full"):
+        replace_file(path, crash)
+    assert path.read_text() == "old"
+
+
+def test_a_kill_while_a_table_is_rewritten_loses_no_row(tmp_path, monkeypatch):
+    table = CsvTable(tmp_path / "t.csv")
+    for updates in (1, 2, 3):
+        table.append({"updates": updates, "a": 0.5})
+    before = (tmp_path / "t.csv").read_text()
+
+    def kill(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("torchrl_aca.training.files.os.replace", kill)
+    with pytest.raises(KeyboardInterrupt):
+        CsvTable(tmp_path / "t.csv", {"updates": 2})
+    assert (tmp_path / "t.csv").read_text() == before
+
+
+def test_half_a_row_of_a_killed_process_is_dropped_on_resume(tmp_path):
+    (tmp_path / "t.csv").write_text("updates,frames,a\n1,5,0.5\nx")
+    table = CsvTable(tmp_path / "t.csv", {"updates": 9, "frames": 99})
+    assert [row["updates"] for row in table.rows] == ["1"]
+
+
+def test_the_first_signal_is_answered_at_once():
+    said = []
+    with StopSignal(said.append) as stop:
+        stop.activity = "evaluation"
         os.kill(os.getpid(), signal.SIGTERM)
-        assert run.stopping
-        run.log_evaluation({"return_mean": 0.0, "return_std": 0.0, "num_episodes": 1.0})
-        run.finish(completed=False)
-    expected = f"stopped by SIGTERM after 3 updates; go on with: python recipe.py resume={run.dir}"
-    assert expected in capsys.readouterr().out
-
-
-VALID = {
-    "algo": {"name": "a"},
-    "logger": {"backend": "csv", "interval": 1},
-    "collector": {"num_envs": 5, "frames_per_batch": 5, "init_random_frames": 100},
-    "buffer": {"capacity": 1000},
-    "optim": {
-        "total_updates": 10,
-        "batch_size": 10,
-        "utd_ratio": 0.2,
-        "lr": 0.1,
-        "gamma": 0.99,
-        "tau": 0.01,
-    },
-    "seed": 0,
-    "eval": {"interval": 1, "episodes": 3, "seed": 10, "stop_return": None},
-    "checkpoint": {"interval": 1, "keep_last": 1},
-    "matmul_precision": "highest",
-    "num_threads": None,
-    "a": {"num_cells": [8, 8]},
-}
-
-
-@pytest.mark.parametrize(
-    ("key", "value", "expected"),
-    [
-        ("algo.name", "b", "one of \\['a'\\]"),
-        ("logger.backend", "paper", "one of"),
-        ("collector.num_envs", 0, "a positive integer"),
-        ("buffer.capacity", -1, "a positive integer"),
-        ("buffer.capacity", 5, "at least optim.batch_size \\(10\\)"),
-        ("collector.init_random_frames", 5, "at least optim.batch_size"),
-        ("collector.init_random_frames", 102, "a multiple of collector.frames_per_batch"),
-        ("collector.frames_per_batch", 7, "a multiple of collector.num_envs"),
-        ("optim.batch_size", 2.5, "a positive integer"),
-        ("optim.batch_size", "many", "a positive integer"),
-        ("optim.utd_ratio", 0, "a number above 0"),
-        ("optim.gamma", 1.5, "at most 1"),
-        ("optim.tau", "x", "a number above 0"),
-        ("eval.episodes", 0, "a positive integer"),
-        ("eval.stop_return", "high", "a number"),
-        ("eval.seed", 4, "apart from the training's 0 to 4"),
-        ("seed", -1, "an integer of at least 0"),
-        ("num_threads", 0, "a positive integer or null"),
-        ("a.num_cells", [8, 0], "positive integers"),
-    ],
-)
-def test_validate_names_the_key_the_value_and_what_was_expected(key, value, expected):
-    cfg = OmegaConf.create(VALID)
-    validate(cfg, {"a": None})
-    OmegaConf.update(cfg, key, value)
-    with pytest.raises(RunError, match=f"{key}=.*{expected}"):
-        validate(cfg, {"a": None})
+        assert said == ["SIGTERM: stopping after this evaluation; Ctrl-C again quits"]
