@@ -74,7 +74,10 @@ def train(cfg: DictConfig, checkpoint: dict[str, Any] | None = None) -> Path:
     dataset, scores = load_offline_data(cfg, env), task_scores(cfg)
     buffer = make_mixture(cfg, dataset, agent.extra_keys)
     collection = Collection(env, agent.policy, cfg.collector, device)
-    facts = {**offline_facts(dataset, buffer), "updates per online frame": cfg.optim.utd_ratio}
+    facts = {
+        **offline_facts(dataset, buffer),
+        "updates per online frame": f"{cfg.optim.utd_ratio:g}",
+    }
 
     def evaluation() -> dict[str, float]:
         result = evaluate(agent.policy, eval_env, cfg.eval.seed, device)

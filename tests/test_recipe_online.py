@@ -262,8 +262,8 @@ def test_a_run_killed_before_its_first_checkpoint_is_started_again_by_its_comman
 
 
 def test_multirun_names_its_jobs_by_their_overrides(tmp_path):
-    sweep = ["--multirun", "seed=0,1", "optim.total_updates=2", "hydra.sweep.dir=sweep"]
-    code, _, errors = run(*TINY_SAC, *sweep, cwd=tmp_path)
+    sweep = ["seed=0,1", "optim.total_updates=2", "hydra.sweep.dir=sweep"]
+    code, _, errors = run("--multirun", *TINY_SAC, *sweep, cwd=tmp_path)
     assert code == 0, errors
     jobs = sorted(path for path in (tmp_path / "sweep").iterdir() if path.is_dir())
     assert len(jobs) == 2

@@ -117,6 +117,7 @@ class Run:
     def _restore(self, checkpoint: dict[str, Any]) -> None:
         done, total = checkpoint["parts"]["counters"].get("updates"), self.cfg.optim.total_updates
         restore(self.parts, checkpoint["parts"])
+        check_rows(checkpoint["parts"]["buffer"], self.collection)
         if self.counters.updates >= total:
             raise RunError(
                 f"resume={self.cfg.resume}: the run already has {done} updates; expected "
@@ -314,6 +315,19 @@ def as_stateful(buffer: Any, agent: Agent) -> Stateful:
     if not isinstance(buffer, ReplayBuffer):
         return buffer
     return BufferState(buffer, (*TRANSITION_KEYS, *agent.extra_keys))
+
+
+def check_rows(state: Mapping[str, Any], collection: Collection) -> None:
+    """Raises `RunError` if a checkpoint's replay rows are not those of the environment."""
+    rows = state.get("online", state)["rows"]
+    spec = {**collection.env.observation_spec, **collection.env.full_action_spec}
+    for key in rows.keys() & spec.keys():
+        expected, got = spec[key].shape[-1], rows[key].shape[-1]
+        if expected != got:
+            raise RunError(
+                f"the checkpoint's replay rows have {got} numbers under {key!r}; the environment "
+                f"gives {expected}. Resume with the unchanged config.yaml of the run."
+            )
 
 
 def updates_due(cfg: RunConfig, frames: int) -> int:
