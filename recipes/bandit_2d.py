@@ -90,7 +90,7 @@ def train(cfg: BanditConfig, method: str, seed: int) -> CriticGuidedDenoisingAct
         actor,
         frames_per_batch=collection.frames_per_batch,
         total_frames=collection.frames,
-        init_random_frames=collection.frames if uniform else collection.init_random_frames,
+        init_random_frames=collection.frames if uniform else collection.warmup_frames,
         auto_register_policy_transforms=False,
     )
     for data in collector:
@@ -144,7 +144,7 @@ def run(task: Task) -> tuple[list[Row], list[Row], bytes]:
         label = {"method": method, "seed": seed, **changed}
         swept += [{**label, **row} for row in sweep(cfg, actor)]
         fresh = measure(draw(actor, cfg.report.num_samples))
-        reported.append({**label, "weight": actor.guidance_weight, **fresh})
+        reported.append({**label, "weight": float(actor.guidance_weight), **fresh})
     return reported, swept, pickle.dumps(actor)
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
+from tensordict import TensorDict
 
 from torchrl_aca.training.checkpoint import list_checkpoints
 
@@ -108,3 +109,41 @@ def assert_same_state(first: Path, second: Path) -> None:
             assert torch.equal(one[key], two[key]), key
         else:
             assert one[key] == two[key], key
+
+
+def collected(num_envs: int = 5, steps: int = 1, observation_dim: int = 17, action_dim: int = 6):
+    shape = (num_envs, steps)
+    observation = torch.randn(*shape, observation_dim)
+    flag = torch.zeros(*shape, 1, dtype=torch.bool)
+    return TensorDict(
+        {
+            "observation": observation,
+            "action": torch.rand(*shape, action_dim),
+            "loc": torch.zeros(*shape, action_dim),
+            "done": flag,
+            "next": {
+                "observation": observation + 1,
+                "reward": torch.randn(*shape, 1),
+                "done": flag.clone(),
+                "terminated": flag.clone(),
+                "truncated": flag.clone(),
+            },
+        },
+        batch_size=shape,
+    )
+
+
+def batch_of(seed: int, size: int = 64) -> TensorDict:
+    """A bandit: any state, an episode of one step, and the best action is 1.5 of [-3, 3]."""
+    generator = torch.Generator().manual_seed(seed)
+    action = 6 * torch.rand(size, 1, generator=generator) - 3
+    ended = torch.ones(size, 1, dtype=torch.bool)
+    following = {
+        "observation": torch.randn(size, 4, generator=generator),
+        "reward": -((action - 1.5) ** 2),
+        "done": ended,
+        "terminated": ended,
+    }
+    observation = torch.randn(size, 4, generator=generator)
+    rows = {"observation": observation, "action": action, "next": following}
+    return TensorDict(rows, batch_size=[size])

@@ -11,7 +11,15 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from agents import AGENTS, configured, load_policy, make_agent
 from online_mujoco import train
-from recipe_cases import CONFIGS, TINY, assert_same_state, composed, rows_of, without_time
+from recipe_cases import (
+    CONFIGS,
+    TINY,
+    assert_same_state,
+    batch_of,
+    composed,
+    rows_of,
+    without_time,
+)
 from torchrl_aca.errors import RunError
 from torchrl_aca.training.envs import make_vector_env
 from torchrl_aca.training.resume import resumed_config
@@ -38,22 +46,6 @@ def built(algo: str, *overrides: str, env: str = "inverted_pendulum", seed: int 
     cfg = configured(composed(*sizes, f"env={env}", *overrides))
     torch.manual_seed(seed)
     return make_agent(cfg, make_vector_env(cfg.env.name, 1, 0), CPU)
-
-
-def batch_of(seed: int, size: int = 64) -> TensorDict:
-    """A bandit: any state, an episode of one step, and the best action is 1.5 of [-3, 3]."""
-    generator = torch.Generator().manual_seed(seed)
-    action = 6 * torch.rand(size, 1, generator=generator) - 3
-    ended = torch.ones(size, 1, dtype=torch.bool)
-    following = {
-        "observation": torch.randn(size, 4, generator=generator),
-        "reward": -((action - 1.5) ** 2),
-        "done": ended,
-        "terminated": ended,
-    }
-    observation = torch.randn(size, 4, generator=generator)
-    rows = {"observation": observation, "action": action, "next": following}
-    return TensorDict(rows, batch_size=[size])
 
 
 def update(agent, numbers) -> list[TensorDict]:

@@ -368,3 +368,33 @@ def test_humanoid_settings_win_over_the_algorithm_and_quickstart_over_both():
     assert (humanoid.target_entropy_scale, other.target_entropy_scale) == (0.5, 0.9)
     assert (humanoid.exploration_noise, other.exploration_noise) == (0.15, 0.1)
     assert composed(name="quickstart").optim.total_updates < composed().optim.total_updates
+
+
+class Legacy(gym.Env):
+    """Draws from NumPy's old generator, whose state Gymnasium's interface does not give."""
+
+    observation_space = gym.spaces.Box(-1, 1, (3,))
+    action_space = gym.spaces.Box(-1, 1, (2,))
+    np_random = np.random.RandomState(0)
+
+    def reset(self, *, seed=None, options=None):
+        return self.np_random.uniform(-1, 1, 3).astype(np.float32), {}
+
+    def step(self, action):
+        return self.np_random.uniform(-1, 1, 3).astype(np.float32), 1.0, False, False, {}
+
+
+def test_an_environment_that_cannot_be_saved_is_left_out_and_said_so(tmp_path, capsys):
+    gym.register("Legacy-v0", Legacy, max_episode_steps=20)
+    try:
+        run_dir = tmp_path / "here"
+        short = ["env.name=Legacy-v0", "optim.total_updates=20", f"run_dir={run_dir}"]
+        train(composed(*TINY_SAC, *short))
+        said = capsys.readouterr().out
+        assert "the state of Legacy-v0 cannot be saved (AttributeError" in said
+        assert "a resumed run begins new episodes" in said
+        typed = [f"resume={run_dir}", "optim.total_updates=30"]
+        train(*resumed_config(composed("algo=sac", *typed), typed))
+        assert rows_of(run_dir / "eval.csv")[-1]["updates"] == "30"
+    finally:
+        del gym.registry["Legacy-v0"]

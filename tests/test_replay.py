@@ -4,31 +4,9 @@ from __future__ import annotations
 
 import pytest
 import torch
-from tensordict import TensorDict
 
+from recipe_cases import collected
 from torchrl_aca.replay import BufferState, make_replay_buffer, transitions
-
-
-def collected(num_envs: int = 5, steps: int = 1, observation_dim: int = 17, action_dim: int = 6):
-    shape = (num_envs, steps)
-    observation = torch.randn(*shape, observation_dim)
-    flag = torch.zeros(*shape, 1, dtype=torch.bool)
-    return TensorDict(
-        {
-            "observation": observation,
-            "action": torch.rand(*shape, action_dim),
-            "loc": torch.zeros(*shape, action_dim),
-            "done": flag,
-            "next": {
-                "observation": observation + 1,
-                "reward": torch.randn(*shape, 1),
-                "done": flag.clone(),
-                "terminated": flag.clone(),
-                "truncated": flag.clone(),
-            },
-        },
-        batch_size=shape,
-    )
 
 
 def test_transitions_are_flat_and_hold_only_what_learning_needs():

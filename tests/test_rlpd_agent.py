@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import pytest
 import torch
-from tensordict import TensorDict
 from torch import nn
 
 from agents import configured
 from agents.rlpd import make_rlpd
-from recipe_cases import composed
+from recipe_cases import batch_of, composed
 from torchrl_aca.training.envs import make_vector_env
 
 INTERVAL, BATCH = 4, 16
@@ -34,25 +33,6 @@ def small(variant):
         "rlpd.num_qvalue_nets=5",
         f"optim.utd_ratio={INTERVAL}",
     ]
-
-
-def batch_of(seed, size=BATCH):
-    """Bandit-like: any state, an episode of one step, and the best action is 1.5."""
-    generator = torch.Generator().manual_seed(seed)
-    action = 6 * torch.rand(size, 1, generator=generator) - 3
-    ended = torch.ones(size, 1, dtype=torch.bool)
-    following = {
-        "observation": torch.randn(size, 4, generator=generator),
-        "reward": -((action - 1.5) ** 2),
-        "done": ended,
-        "terminated": ended,
-    }
-    return TensorDict(
-        observation=torch.randn(size, 4, generator=generator),
-        action=action,
-        next=following,
-        batch_size=[size],
-    )
 
 
 def run(agent, updates, size=BATCH):
@@ -96,7 +76,7 @@ def test_the_actor_sees_the_last_batch_or_all_since_its_last_step(make_agent, va
     network.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
     run(agent, range(2 * INTERVAL))
     last = range(2 * INTERVAL - num_batches, 2 * INTERVAL)
-    expected = torch.cat([batch_of(i)["observation"] for i in last])
+    expected = torch.cat([batch_of(i, BATCH)["observation"] for i in last])
     torch.testing.assert_close(seen[-1], expected, rtol=0, atol=0)
 
 

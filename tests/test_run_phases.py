@@ -235,3 +235,16 @@ def test_an_offline_phase_needs_an_agent_that_has_one(tmp_path, monkeypatch):
     with pytest.raises(RunError, match="optim.offline_updates=30: expected 0.*algo=toy"):
         train(tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+def test_a_part_that_cannot_be_saved_is_told_before_training(tmp_path, monkeypatch):
+    class Unsavable:
+        def state_dict(self):
+            raise TypeError("no state")
+
+    agent = toy_agent()
+    agent.state["counter"] = Unsavable()
+    monkeypatch.setattr("test_run_phases.toy_agent", lambda: agent)
+    with pytest.raises(RunError, match="'agent.counter' cannot be saved .TypeError: no state"):
+        train(tmp_path / "run")
+    assert not (tmp_path / "run").exists()

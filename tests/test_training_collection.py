@@ -4,32 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
-from tensordict import TensorDict
 
+from recipe_cases import collected
 from torchrl_aca.errors import RunError
 from torchrl_aca.training.collection import EpisodeTracker, check_finite
-
-
-def collected(num_envs: int = 5, steps: int = 1, observation_dim: int = 17, action_dim: int = 6):
-    shape = (num_envs, steps)
-    observation = torch.randn(*shape, observation_dim)
-    flag = torch.zeros(*shape, 1, dtype=torch.bool)
-    return TensorDict(
-        {
-            "observation": observation,
-            "action": torch.rand(*shape, action_dim),
-            "loc": torch.zeros(*shape, action_dim),
-            "done": flag,
-            "next": {
-                "observation": observation + 1,
-                "reward": torch.randn(*shape, 1),
-                "done": flag.clone(),
-                "terminated": flag.clone(),
-                "truncated": flag.clone(),
-            },
-        },
-        batch_size=shape,
-    )
 
 
 def test_episode_tracker_sums_per_environment_and_restores():

@@ -61,7 +61,7 @@ class Collector(Section):
     half_width: Positive
     frames: Count
     frames_per_batch: Count
-    init_random_frames: Annotated[int, Field(ge=0)]
+    warmup_frames: Annotated[int, Field(ge=0)]
     guidance_weight: dict[Method, NonNegative]
 
 
