@@ -54,16 +54,19 @@ def test_minari_experience_replay_returns_zeros(tmp_path, monkeypatch):
 
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
     monkeypatch.chdir(tmp_path)
-    episode = EpisodeBuffer(
-        id=0,
-        observations=ones(6, 3),
-        actions=ones(5, 2),
-        rewards=ones(5),
-        terminations=np.zeros(5, dtype=bool),
-        truncations=np.arange(5) == 4,
-    )
+    episodes = [
+        EpisodeBuffer(
+            id=number,
+            observations=ones(6, 3),
+            actions=ones(5, 2),
+            rewards=ones(5),
+            terminations=np.zeros(5, dtype=bool),
+            truncations=np.arange(5) == 4,
+        )
+        for number in range(2)
+    ]
     spaces = {"observation_space": Box(-1, 1, (3,)), "action_space": Box(-1, 1, (2,))}
-    minari.create_dataset_from_buffers("toy/ones-v0", [episode], **spaces)
+    minari.create_dataset_from_buffers("toy/ones-v0", episodes, **spaces)
     stored = minari.load_dataset("toy/ones-v0")[0]
     data = MinariExperienceReplay(
         "toy/ones-v0", batch_size=8, root="torchrl", load_from_local_minari=True, download=False

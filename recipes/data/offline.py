@@ -48,6 +48,11 @@ def dataset_path(cfg: Any) -> Path:
     )
 
 
+def needs_data(cfg: Any) -> bool:
+    """Whether there are minibatches with rows of the data set, in the online phase or before."""
+    return bool(cfg.offline_fraction or cfg.optim.offline_updates)
+
+
 def generate_missing(cfg: Any) -> None:
     """Makes the data set where there is none and `cfg.generate` says how.
 
@@ -57,7 +62,7 @@ def generate_missing(cfg: Any) -> None:
         DatasetError: See `make_dataset`.
         RunError: See `make_dataset`; or if `generate` has a key that this does not have.
     """
-    if cfg.generate is None or not cfg.offline_fraction or dataset_path(cfg).exists():
+    if cfg.generate is None or not needs_data(cfg) or dataset_path(cfg).exists():
         return
     if own := {"path", "env"} & cfg.generate.keys():
         raise RunError(
@@ -76,13 +81,13 @@ def generate_missing(cfg: Any) -> None:
 
 
 def load_offline_data(cfg: Any, env: EnvBase) -> OfflineDataset | None:
-    """The data set, or None where no minibatch has a part of it.
+    """The data set, or None where neither phase has a minibatch with a part of it.
 
     Raises:
         DatasetError: If there is none, or it is damaged.
         RunError: If it was made in another environment than `env`.
     """
-    if not cfg.offline_fraction:
+    if not needs_data(cfg):
         return None
     dataset = OfflineDataset.load(dataset_path(cfg), verify=True)
     require_fit(cfg, dataset.metadata, env)
