@@ -184,6 +184,26 @@ def test_every_batch_has_its_share_of_offline_rows(
     assert {len(rewards) for rewards in seen} == {16}
 
 
+@pytest.mark.parametrize(("fraction", "offline"), [("0.25", 4), ("0", 0)])
+def test_an_offline_phase_has_offline_rows_alone(
+    fraction, offline, data, train, seen, tmp_path, monkeypatch
+):
+    """With an agent whose update of the offline phase is the usual one."""
+    method = AGENTS["aca"]
+
+    def with_offline_phase(cfg, env, device):
+        agent = method.make(cfg, env, device)
+        agent.offline_update = agent.update
+        return agent
+
+    monkeypatch.setitem(AGENTS, "aca", replace(method, make=with_offline_phase))
+    typed = [f"offline_fraction={fraction}", "optim.offline_updates=4", "optim.total_updates=3"]
+    run_dir = train(*settings(data, tmp_path / "here"), *typed)
+    assert [int((rewards > MARK).sum()) for rewards in seen] == [16] * 4 + [offline] * 3
+    facts = f"| offline rows of a minibatch | {offline} of 16 |"
+    assert facts in (run_dir / "card.md").read_text()
+
+
 def test_without_offline_rows_no_data_set_is_needed(train, seen, tmp_path):
     typed = ["dataset=null", "offline_fraction=0", "optim.total_updates=3"]
     run_dir = train(*settings(tmp_path, tmp_path / "here"), *typed)
