@@ -3,9 +3,6 @@ from __future__ import annotations
 import inspect
 from importlib.metadata import version as installed_version
 
-from docutils.nodes import SkipNode
-from latex2mathml.converter import convert
-
 project = "torchrl-aca"
 author = "The torchrl-aca authors"
 copyright = f"2026, {author}"
@@ -17,11 +14,11 @@ extensions = [
     "sphinx.ext.intersphinx",
     "sphinx.ext.napoleon",
     "sphinx.ext.viewcode",
+    "sphinx-mathjax-offline",  # ships MathJax and its fonts: formulas need no network
 ]
 exclude_patterns = ["_build"]
 default_role = "literal"  # docstrings of `training` have single backticks
 html_theme = "furo"
-html_math_renderer = "mathml"
 html_title = f"torchrl-aca {release}"
 
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
@@ -55,17 +52,5 @@ def show_constructor(app, what, name, obj, options, signature, returns):
     return signature, returns
 
 
-def visit_inline_math(writer, node):
-    """MathML, which browsers render without a script: MathJax would be fetched from elsewhere."""
-    writer.body.append(convert(node.astext()))
-    raise SkipNode
-
-
-def visit_displayed_math(writer, node):
-    writer.body.append(f'<div class="formula">{convert(node.astext(), display="block")}</div>')
-    raise SkipNode
-
-
 def setup(app):
-    app.add_html_math_renderer("mathml", (visit_inline_math, None), (visit_displayed_math, None))
     app.connect("autodoc-process-signature", show_constructor)
