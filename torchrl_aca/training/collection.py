@@ -90,7 +90,7 @@ class Collection:
         if self._collector is not None:
             self._collector.shutdown()
 
-    def require_savable(self) -> str | None:
+    def why_unsavable(self) -> str | None:
         """Tries to save the environments, and returns why not where that fails."""
         try:
             EnvState(self.env).state_dict()

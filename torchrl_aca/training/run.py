@@ -127,7 +127,7 @@ class Run:
     def _savable_parts(self) -> list[str]:
         """Takes the state of every part once, so that no part fails at the first checkpoint."""
         notes = []
-        if why := self.collection.require_savable():
+        if why := self.collection.why_unsavable():
             notes.append(
                 f"the state of {self.cfg.env.name} cannot be saved ({why}): checkpoints leave it "
                 "out, and a resumed run begins new episodes"
