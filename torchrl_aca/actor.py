@@ -66,8 +66,10 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
             carry it; ``actor.guidance_weight = 3`` sets it. Default: 50.
         num_candidates: ``N``. Default: 32.
         num_inference_steps: number ``S`` of steps of the chain, from 2 to ``T``. Fewer than ``T``
-            visit every few levels only (:func:`~torchrl_aca.chain.inference_levels`): cheaper, and
-            not the same distribution. Default: ``T``, the paper's chain.
+            visit the low levels and skip high ones (:func:`~torchrl_aca.chain.inference_levels`).
+            Default: ``T``, the paper's chain.
+        inference_levels: the levels that the chain visits, rising from 1 to ``T``, instead of
+            those that ``num_inference_steps`` chooses.
         normalize_gradient: guide by the unit gradient. Default: True.
         clip_denoised: clip the clean estimate to [-1, 1] in every step, or to [-c, c] for a number
             ``c``; False or 0 leaves it. Langevin steps make no clean estimate. Default: True.
@@ -90,7 +92,8 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
 
     Raises:
         ValueError: if a number is out of range, the spec is not a bounded vector, or the critic and
-            the schedule differ in ``num_steps``.
+            the schedule differ in ``num_steps``; also for both ``num_inference_steps`` and
+            ``inference_levels``, or levels that do not rise from 1 to ``T``.
 
     Examples:
         >>> critic = NoiseLevelCritic(17, 6)
@@ -114,6 +117,7 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         guidance_weight: float = 50.0,
         num_candidates: int = 32,
         num_inference_steps: int | None = None,
+        inference_levels: Sequence[int] | None = None,
         normalize_gradient: bool = True,
         clip_denoised: bool | float = True,
         sampler: Literal["denoising", "langevin"] = "denoising",
@@ -143,11 +147,9 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         anchor = first_parameter(self.critic)
         # A copy: `to` works in place, and the schedule may serve actors on other devices too.
         self.schedule = copy.deepcopy(schedule).to(anchor.device)
-        if num_inference_steps is None:
-            num_inference_steps = schedule.num_steps
-        self.num_inference_steps = num_inference_steps
-        levels = chain.inference_levels(schedule.num_steps, num_inference_steps)
-        self.chain_schedule = self.schedule.restrict(levels)
+        self.inference_levels = _levels(schedule.num_steps, num_inference_steps, inference_levels)
+        self.num_inference_steps = len(self.inference_levels)
+        self.chain_schedule = self.schedule.restrict(self.inference_levels)
         self.num_candidates = num_candidates
         self.normalize_gradient = normalize_gradient
         self.clip_denoised = clip_denoised
@@ -373,6 +375,15 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         deterministic = exploration_type() not in (None, ExplorationType.RANDOM)
         action = self.sample(observation, batch, deterministic=deterministic)
         return tensordict.set(self.out_keys[0], action)
+
+
+def _levels(num_levels: int, num_steps: int | None, levels: Sequence[int] | None) -> list[int]:
+    """The levels of the chain: all of them, or as many as asked for, or those given."""
+    if levels is None:
+        return chain.inference_levels(num_levels, num_levels if num_steps is None else num_steps)
+    if num_steps is not None:
+        raise ValueError("Expected num_inference_steps or inference_levels, got both. Drop one.")
+    return chain.check_levels(levels, num_levels)
 
 
 def _clean_level(action: Tensor) -> Tensor:

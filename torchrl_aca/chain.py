@@ -17,13 +17,26 @@ from torch import Tensor
 from torchrl_aca import functional as F
 from torchrl_aca.schedule import NoiseSchedule
 
-__all__ = ["StepRunner", "denoise", "inference_levels", "langevin", "posterior_step", "tiles"]
+__all__ = [
+    "StepRunner",
+    "check_levels",
+    "denoise",
+    "inference_levels",
+    "langevin",
+    "posterior_step",
+    "tiles",
+]
 
 Variance = Literal["posterior", "beta"]
 
 
 def inference_levels(num_levels: int, num_steps: int) -> list[int]:
-    """The levels that a chain of ``num_steps`` visits: evenly from 1 to ``T``, both included.
+    """The levels that a chain of ``num_steps`` visits: densely at the bottom, sparsely at the top.
+
+    Level ``k`` of ``S`` is ``1 + (T - 1) ((k - 1) / (S - 1))^3``, rounded, or the next free one
+    where that is taken. The low levels decide the action: the guidance's stride falls with the
+    level, and the last strides leave the spread of the candidates; at the high levels the clean
+    estimate lies on the border of its box whatever the stride.
 
     Args:
         num_levels: number ``T`` of noise levels.
@@ -31,12 +44,39 @@ def inference_levels(num_levels: int, num_steps: int) -> list[int]:
 
     Raises:
         ValueError: if ``num_steps`` is not one of those.
+
+    Examples:
+        >>> inference_levels(20, 8)
+        [1, 2, 3, 4, 5, 8, 13, 20]
     """
     if num_steps == num_levels:
         return list(range(1, num_levels + 1))
     if not isinstance(num_steps, int) or not 2 <= num_steps < num_levels:
         raise ValueError(f"Expected a number of steps from 2 to {num_levels}, got {num_steps!r}.")
-    return (torch.linspace(0, num_levels - 1, num_steps).round().long() + 1).tolist()
+    grid = torch.linspace(0, 1, num_steps, dtype=torch.float64)
+    levels = (1 + (num_levels - 1) * grid**3).round().long()
+    return torch.maximum(levels, torch.arange(1, num_steps + 1)).tolist()
+
+
+def check_levels(levels: Sequence[int], num_levels: int) -> list[int]:
+    """The levels of a chain, as given.
+
+    Args:
+        levels: rising integers from 1 to ``T``, both included: the last step ends at the clean
+            action, and the first starts from standard normal noise.
+        num_levels: number ``T`` of noise levels.
+
+    Raises:
+        ValueError: if they are not.
+    """
+    given = list(levels)
+    rising = all(isinstance(level, int) for level in given) and given == sorted(set(given))
+    if len(given) < 2 or not rising or (given[0], given[-1]) != (1, num_levels):
+        raise ValueError(
+            f"Expected inference_levels as rising integers from 1 to {num_levels}, both included, "
+            f"such as {inference_levels(num_levels, min(num_levels, 4))}; got {given}."
+        )
+    return given
 
 
 # --- the chains -----------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ from torchrl.envs import EnvBase
 from torchrl.objectives import SoftUpdate
 
 from torchrl_aca import ACALoss, CriticGuidedDenoisingActor, NoiseLevelCritic, NoiseSchedule
+from torchrl_aca.chain import check_levels
 from torchrl_aca.training.acceleration import capture, compiled, descend, make_adam
 from torchrl_aca.training.agent import Agent
 from torchrl_aca.training.checkpoint import Counters
@@ -37,6 +38,7 @@ class ACASettings(Section):
 
     num_steps: Annotated[int, Field(ge=1, le=1000)]
     num_inference_steps: Annotated[int, Field(ge=1, le=1000)]
+    inference_levels: list[int] | None
     schedule: Literal["cosine", "linear", "vp"]
     num_cells: Widths
     num_critics: Annotated[int, Field(ge=1, le=1000)]
@@ -56,7 +58,19 @@ class ACASettings(Section):
     def _levels(self) -> ACASettings:
         if self.num_inference_steps > self.num_steps:
             self.refuse("num_inference_steps", f"at most aca.num_steps ({self.num_steps})")
+        if self.inference_levels is not None:
+            self._check_levels(self.inference_levels)
         return self
+
+    def _check_levels(self, levels: list[int]) -> None:
+        """They replace `num_inference_steps`, which then holds its default or their number."""
+        try:
+            check_levels(levels, self.num_steps)
+        except ValueError:
+            expected = f"rising integers from 1 to aca.num_steps ({self.num_steps}), both included"
+            self.refuse("inference_levels", expected)
+        if self.num_inference_steps not in (self.num_steps, len(levels)):
+            self.refuse("num_inference_steps", "left out beside aca.inference_levels")
 
 
 class ACAOptim(Optim):
@@ -78,7 +92,7 @@ class ACAOptim(Optim):
 
 def make_aca_loss(cfg: Any, env: EnvBase, device: torch.device) -> ACALoss:
     """The critic, the actor that it guides, and their loss."""
-    settings = cfg.aca
+    settings, levels = cfg.aca, cfg.aca.inference_levels
     action_spec = env.action_spec_unbatched
     critic = NoiseLevelCritic(
         env.observation_spec["observation"].shape[-1],
@@ -95,7 +109,8 @@ def make_aca_loss(cfg: Any, env: EnvBase, device: torch.device) -> ACALoss:
         spec=action_spec,
         guidance_weight=settings.guidance_weight,
         num_candidates=settings.num_candidates,
-        num_inference_steps=settings.num_inference_steps,
+        num_inference_steps=settings.num_inference_steps if levels is None else None,
+        inference_levels=levels,
         exploration_noise=settings.exploration_noise,
         alpha_init=settings.alpha_init,
         deterministic_draws=cfg.eval.draws,
