@@ -89,7 +89,7 @@ def test_denoise_equals_the_oracle(first_level, unit, schedules, clip, weight):
 @pytest.mark.parametrize("levels", [[1, 6], [1, 3, 6], [1, 2, 3, 5, 6], [1, 2, 3, 4, 5, 6]])
 def test_a_chain_of_fewer_steps_equals_ddim_on_these_levels(levels, unit, first_level):
     critic = make_critic(first_level=first_level, dtype=torch.float64)
-    actor = make_actor(critic, num_inference_steps=len(levels), normalize_gradient=unit)
+    actor = make_actor(critic, inference_levels=levels, normalize_gradient=unit)
     observation = torch.randn(BATCH, OBS, dtype=torch.float64)
     noise = torch.randn(len(levels) + 1, CANDIDATES, BATCH, ACTION, dtype=torch.float64)
     expected = oracle.ddim_chain(
@@ -106,6 +106,18 @@ def test_number_of_inference_steps_must_fit_the_levels(steps):
         make_actor(num_inference_steps=steps)
 
 
+def test_levels_are_chosen_or_given():
+    assert make_actor().inference_levels == [1, 2, 3, 4, 5, 6]
+    assert make_actor(num_inference_steps=4).inference_levels == [1, 2, 3, 6]
+    given = make_actor(inference_levels=(1, 4, 6))
+    assert given.inference_levels == [1, 4, 6]
+    assert given.num_inference_steps == 3
+    with pytest.raises(ValueError, match="num_inference_steps or inference_levels, got both"):
+        make_actor(num_inference_steps=3, inference_levels=[1, 4, 6])
+    with pytest.raises(ValueError, match="rising integers from 1 to 6, both included"):
+        make_actor(inference_levels=[1, 4])
+
+
 def test_fewer_steps_ask_the_critic_less_often_and_act_in_every_way(monkeypatch):
     actor = make_actor(num_inference_steps=3)
     asked, gradient = [], actor.critic.action_gradient
@@ -116,7 +128,7 @@ def test_fewer_steps_ask_the_critic_less_often_and_act_in_every_way(monkeypatch)
     )
     td = observe(BATCH)
     assert act(actor, td).shape == (BATCH, ACTION)
-    assert asked == [6, 3]  # not at level 1, where sigma is 0
+    assert asked == [6, 2]  # not at level 1, where sigma is 0
     with DETERMINISTIC:
         torch.testing.assert_close(act(actor, td), act(actor, td), rtol=0, atol=0)
 

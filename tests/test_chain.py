@@ -10,7 +10,15 @@ import torch
 
 import oracle
 from torchrl_aca import NoiseSchedule
-from torchrl_aca.chain import StepRunner, denoise, inference_levels, langevin, posterior_step, tiles
+from torchrl_aca.chain import (
+    StepRunner,
+    check_levels,
+    denoise,
+    inference_levels,
+    langevin,
+    posterior_step,
+    tiles,
+)
 
 T, N, BATCH, ACTION = 6, 3, 4, 2
 BETAS = {"cosine": oracle.cosine_betas(T), "linear": oracle.linear_betas(T, 0.1, 0.5)}
@@ -123,11 +131,32 @@ def test_denoise_equals_numpy_on_all_levels_and_on_some(kind, num_steps, options
     assert torch.equal(end, path[-1])
 
 
-def test_the_levels_of_a_short_chain_lie_evenly_and_include_both_ends():
+def test_a_short_chain_visits_the_low_levels_by_a_cubic_law():
     assert inference_levels(20, 2) == [1, 20]
-    assert inference_levels(21, 5) == [1, 6, 11, 16, 21]
+    assert inference_levels(20, 8) == [1, 2, 3, 4, 5, 8, 13, 20]
+    assert inference_levels(28, 4) == [1, 2, 9, 28]  # 1 + 27 (k / 3)^3
     assert inference_levels(4, 4) == [1, 2, 3, 4]
     assert inference_levels(1, 1) == [1]
+
+
+@pytest.mark.parametrize("num_levels", [2, 3, 10, 20, 57, 100])
+def test_every_short_chain_rises_from_1_to_the_top_in_growing_strides(num_levels):
+    for num_steps in range(2, num_levels + 1):
+        levels = inference_levels(num_levels, num_steps)
+        assert check_levels(levels, num_levels) == levels
+        assert len(levels) == num_steps
+        strides = [high - low for low, high in zip(levels, levels[1:], strict=False)]
+        assert all(
+            after - before >= -1 for before, after in zip(strides, strides[1:], strict=False)
+        )
+
+
+@pytest.mark.parametrize(
+    "levels", [[], [6], [1, 3], [2, 6], [1, 3, 3, 6], [1, 5, 3, 6], [1, 2.0, 6], [0, 1, 6], [1, 7]]
+)
+def test_levels_of_ones_own_must_rise_from_1_to_the_top(levels):
+    with pytest.raises(ValueError, match=r"rising integers from 1 to 6, .* such as \[1, 2, 3, 6\]"):
+        check_levels(levels, 6)
 
 
 def test_a_predictor_of_no_noise_at_the_end_need_not_be_asked_there():

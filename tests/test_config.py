@@ -38,6 +38,9 @@ REFUSED = [
     ("aca.first_level=3", "aca.first_level=3: expected less than or equal to 1"),
     ("aca.num_steps=100000000", "aca.num_steps=100000000: expected less than or equal to 1000"),
     ("aca.num_inference_steps=30", r"num_inference_steps=30: expected at most aca.num_steps \(20"),
+    ("aca.inference_levels=[1,5,3,20]", r"inference_levels=\[1, 5, 3, 20\]: expected rising"),
+    ("aca.inference_levels=[1,5]", r"rising integers from 1 to aca.num_steps \(20\)"),
+    ("aca.inference_levels=[1,2.5,20]", "aca.inference_levels.1=2.5: expected a valid integer"),
     ("aca.noise_level_interval=0", "noise_level_interval=0: expected greater than"),
     ("aca.num_candidates=-1", "num_candidates=-1"),
     ("aca.schedule=steep", "aca.schedule='steep': expected 'cosine', 'linear' or 'vp'"),
@@ -91,7 +94,12 @@ def test_a_mistake_is_told_with_key_expected_and_got(override, message):
         configured(composed(override))
 
 
-RIVALS = [
+BESIDE = [
+    (
+        "aca.inference_levels=[1,5,20]",
+        "aca.num_inference_steps=8",
+        "aca.num_inference_steps=8: expected left out beside aca.inference_levels",
+    ),
     ("algo=rlpd", "rlpd.subset_size=11", r"at most rlpd.num_qvalue_nets \(10\)"),
     ("algo=rlpd", "rlpd.init=zeros", "rlpd.init='zeros': expected 'xavier_uniform' or"),
     ("algo=rlpd", "optim.actor_lr=0", "optim.actor_lr=0: expected greater than 0"),
@@ -107,10 +115,10 @@ RIVALS = [
 ]
 
 
-@pytest.mark.parametrize(("algo", "override", "message"), RIVALS)
-def test_a_mistake_in_a_rival_is_told_as_well(algo, override, message):
+@pytest.mark.parametrize(("setting", "override", "message"), BESIDE)
+def test_a_mistake_beside_another_setting_is_told_as_well(setting, override, message):
     with pytest.raises(RunError, match=message):
-        configured(composed(algo, override))
+        configured(composed(setting, override))
 
 
 @pytest.mark.parametrize(

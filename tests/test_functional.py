@@ -113,6 +113,32 @@ def test_slope_of_mish_is_one_up_to_the_largest_number(dtype):
     assert torch.equal(value, large) and (slope == 1).all()
 
 
+def test_mish_by_hand():
+    # e = 2 and n = 8 at x = log 2: mish = 4/5 log 2.
+    close(F.mish(tensor(math.log(2))), tensor(0.8 * math.log(2)))
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), MISH_DTYPES)
+def test_mish_and_its_gradient_agree_with_pytorchs(dtype, tolerance):
+    x = torch.linspace(-100, 100, 20_001, dtype=dtype).requires_grad_()
+    exact = x.detach().double().requires_grad_()
+    expected, value = nn.functional.mish(exact), F.mish(x)
+    (expected_slope,) = torch.autograd.grad(expected.sum(), exact)
+    (slope,) = torch.autograd.grad(value.sum(), x)
+    assert value.dtype == slope.dtype == dtype
+    torch.testing.assert_close(value.double(), expected.detach(), rtol=tolerance, atol=tolerance)
+    torch.testing.assert_close(slope.double(), expected_slope, rtol=tolerance, atol=tolerance)
+
+
+@pytest.mark.parametrize("activation", [nn.Mish(), nn.Tanh()])
+def test_an_activation_is_the_same_compiled_and_not(activation):
+    x = torch.linspace(-5, 5, 101, dtype=torch.float64).requires_grad_()
+    compiled = torch.compile(F.activate, fullgraph=True)(activation, x)
+    torch.testing.assert_close(compiled, activation(x), rtol=1e-12, atol=1e-12)
+    slopes = [torch.autograd.grad(y.sum(), x)[0] for y in (compiled, activation(x))]
+    torch.testing.assert_close(*slopes, rtol=1e-12, atol=1e-12)
+
+
 ACTIVATIONS = [nn.Mish, nn.ReLU, nn.GELU, nn.SiLU, nn.Tanh, nn.ELU, nn.Softplus, nn.LeakyReLU]
 
 

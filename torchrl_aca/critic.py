@@ -225,9 +225,9 @@ class NoiseLevelCritic(NoiseLevelCriticBase):
         return state_share, torch.baddbmm(first.bias, embedding, level_weight)
 
     def _evaluate(self, features: Any, action: Tensor, index: Tensor) -> Tensor:
-        x = self.activation(self._first_layer(features, action, index))
+        x = F.activate(self.activation, self._first_layer(features, action, index))
         for layer in self._others:
-            x = self.activation(layer(x))
+            x = F.activate(self.activation, layer(x))
         return (
             self.value(x).squeeze(-1).movedim(0, -1).reshape(*action.shape[:-1], self.num_critics)
         )

@@ -9,17 +9,21 @@ standard deviation, ``w`` = guidance weight. Actions here are always in critic u
 from __future__ import annotations
 
 import math
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 __all__ = [
+    "activate",
     "activation_and_slope",
     "add_noise",
     "cosine_betas",
     "guided_noise",
     "langevin_step",
     "linear_betas",
+    "mish",
     "mish_and_slope",
     "noise_level_target",
     "normalize_gradient",
@@ -147,6 +151,38 @@ def mish_and_slope(x: Tensor) -> tuple[Tensor, Tensor]:
     gate = n.mul_(inverse)
     slope = (e + 1).mul_(e).mul_(inverse).mul_(inverse).mul_(bounded.mul_(4))
     return x * gate, slope.add_(gate)
+
+
+def mish(x: Tensor) -> Tensor:
+    """``mish(x) = x tanh(softplus(x))``; the backward pass multiplies by the forward pass's slope.
+
+    PyTorch's own takes an exponential, a logarithm and a hyperbolic tangent, and a compiler follows
+    it there; this takes one exponential (:func:`mish_and_slope`). It is differentiable once.
+    """
+    return cast(Tensor, _Mish.apply(x))
+
+
+class _Mish(torch.autograd.Function):
+    """Mish by :func:`mish_and_slope`."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        value, slope = mish_and_slope(x)
+        ctx.save_for_backward(slope)
+        return value
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        (slope,) = ctx.saved_tensors
+        return gradient * slope
+
+
+def activate(activation: nn.Module, x: Tensor) -> Tensor:
+    """``f(x)`` of an elementwise activation: Mish in the form that is fast where it is called."""
+    if isinstance(activation, nn.Mish) and torch.compiler.is_compiling():
+        return mish(x)
+    return activation(x)
 
 
 def activation_and_slope(activation: nn.Module, x: Tensor) -> tuple[Tensor, Tensor]:

@@ -84,14 +84,25 @@ def make_agent(cfg: RunConfig, env: EnvBase, device: torch.device) -> Agent:
 
 
 def load_policy(
-    run_dir: str | Path, device: str | torch.device = "cpu"
+    run_dir: str | Path, device: str | torch.device = "cpu", updates: int | None = None
 ) -> tuple[TensorDictModuleBase, RunConfig]:
-    """Returns the policy that a run ended with, and the run's configuration.
+    """Returns the policy of a run, and the run's configuration.
+
+    Args:
+        run_dir: The run's directory.
+        device: Where the policy is put.
+        updates: After how many updates; one of the kept checkpoints. Default: the newest.
 
     Raises:
-        RunError: If there is no run, or its newest checkpoint cannot be used.
+        RunError: If there is no run, or its checkpoint cannot be used.
     """
-    checkpoint = read_checkpoint(Path(run_dir))
+    return policy_of(read_checkpoint(Path(run_dir), updates), device)
+
+
+def policy_of(
+    checkpoint: Mapping[str, Any], device: str | torch.device = "cpu"
+) -> tuple[TensorDictModuleBase, RunConfig]:
+    """Returns the policy that a checkpoint holds, and the configuration of its run."""
     stored = OmegaConf.create(checkpoint["config"])
     recipe_keys = {*RunConfig.model_fields, *AGENTS[stored.algo.name].sections}
     cfg = configured(OmegaConf.masked_copy(stored, [k for k in stored if k in recipe_keys]))

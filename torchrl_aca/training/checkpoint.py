@@ -78,8 +78,8 @@ def list_checkpoints(directory: Path) -> list[Path]:
     return sorted(directory.glob("checkpoint_*.pt"))
 
 
-def read_checkpoint(run_dir: Path) -> dict[str, Any]:
-    """Reads the newest checkpoint of a run directory.
+def read_checkpoint(run_dir: Path, updates: int | None = None) -> dict[str, Any]:
+    """Reads a checkpoint of a run directory: the newest, or that of so many updates.
 
     Returns:
         A dict with "config" and "parts".
@@ -95,10 +95,23 @@ def read_checkpoint(run_dir: Path) -> dict[str, Any]:
             "none. Give the directory that the run printed when it started; a run that was killed "
             "before its first checkpoint is started again by its own command."
         )
+    if updates is not None:
+        checkpoints = _up_to(checkpoints, updates)
     content, fault = _read(checkpoints[-1])
     if fault:
         raise RunError(f"{checkpoints[-1]} {fault}. {_way_out(checkpoints)}")
     return content
+
+
+def _up_to(checkpoints: list[Path], updates: int) -> list[Path]:
+    """The checkpoints up to the one of so many updates."""
+    kept = [updates_of(path) for path in checkpoints]
+    if updates not in kept:
+        raise RunError(
+            f"{checkpoints[0].parent}: expected a checkpoint of {updates} updates, found those of "
+            f"{kept}. Choose one of them."
+        )
+    return checkpoints[: kept.index(updates) + 1]
 
 
 def _way_out(checkpoints: list[Path]) -> str:

@@ -1,0 +1,1 @@
+"""What a short chain changes: the parts of `chain_fidelity.py`."""
