@@ -25,7 +25,7 @@ export WANDB_DATA_DIR := $(CACHE)/wandb-data
 # A run that is told to stop keeps it until its checkpoint is written, hence the second trap.
 WITH_TMPDIR = tmp=$$(mktemp -d) && trap 'rm -rf "$$tmp"' EXIT && trap : TERM && export TMPDIR="$$tmp" &&
 
-.PHONY: help install demo test docs lint format bench clean
+.PHONY: help install demo test docs lint format bench gpu clean
 
 help:  ## list the targets
 	@sed -nE 's/^([a-z]+):.*## (.*)/\1\t\2/p' $(MAKEFILE_LIST) | expand -t 10
@@ -62,6 +62,9 @@ format: $(INSTALLED)  ## repair style and format
 bench: $(INSTALLED)  ## measure speed and write results/speed.md (THREADS=2, OUT=another.md)
 	@$(WITH_TMPDIR) $(VENV) -m pytest benchmarks -q --benchmark-only --benchmark-json=$(CACHE)/speed.json $(ARGS)
 	@$(VENV) benchmarks/report.py $(CACHE)/speed.json $(OUT)
+
+gpu:  ## on a machine with CUDA, with the torch of PYTHON: tests, speed, a short training -> results/gpu
+	PYTHONPATH=$(CURDIR):recipes:benchmarks $(PYTHON) benchmarks/gpu.py $(ARGS)
 
 clean:  ## remove caches and builds, keep .venv and outputs
 	rm -rf .cache docs/_build build dist *.egg-info

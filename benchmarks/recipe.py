@@ -18,12 +18,12 @@ from torchrl_aca.training.config import RunConfig
 CONFIGS = Path(__file__).resolve().parents[1] / "recipes/configs"
 
 
-def configure(*overrides: str) -> RunConfig:
-    """The configuration of `python recipes/online_mujoco.py algo=aca OVERRIDES`."""
+def configure(*overrides: str, name: str = "online_mujoco") -> RunConfig:
+    """The configuration of `python recipes/online_mujoco.py --config-name NAME OVERRIDES`."""
     with hydra.initialize_config_dir(str(CONFIGS), version_base="1.3"):
-        return configured(hydra.compose("online_mujoco", ["algo=aca", *overrides]))
+        return configured(hydra.compose(name, ["algo=aca", *overrides]))
 
 
-def make_recipe_agent(cfg: RunConfig, env: EnvBase) -> Agent:
-    """The agent of that configuration, on the CPU."""
-    return make_agent(cfg, env, torch.device("cpu"))
+def make_recipe_agent(cfg: RunConfig, env: EnvBase, device: str | torch.device = "cpu") -> Agent:
+    """The agent of that configuration."""
+    return make_agent(cfg, env, torch.device(device))

@@ -57,20 +57,21 @@ def table(results: list[dict]) -> str:
 
 def loop_overhead(results: list[dict]) -> str:
     """What the loop around acting and update costs; empty where no iteration was timed."""
+    iterations: dict[tuple[str, str], dict[str, float]] = {}
+    for result in results:
+        info = result["extra_info"]
+        settings, _, part = info["case"].partition(": ")
+        if settings.startswith("iteration"):
+            seconds = iterations.setdefault((settings, info["variant"]), {})
+            seconds[part] = result["stats"]["median"]
     lines = []
-    for variant in ("eager", "compiled"):
-        seconds = {
-            r["extra_info"]["case"].partition(": ")[2]: r["stats"]["median"]
-            for r in results
-            if r["extra_info"]["case"].startswith("iteration")
-            and r["extra_info"]["variant"] == variant
-        }
+    for (settings, variant), seconds in iterations.items():
         if {"whole", "acting, 5 states x 32", "update"} <= seconds.keys():
             whole = seconds["whole"]
             rest = whole - seconds["acting, 5 states x 32"] - seconds["update"]
             lines.append(
-                f"Of an iteration with N = 1 ({variant}), all that is neither acting nor the "
-                f"update takes {1e3 * rest:.1f} of {1e3 * whole:.1f} ms, {rest / whole:.0%}.\n"
+                f"- {settings} ({variant}): all that is neither acting nor the update takes "
+                f"{1e3 * rest:.1f} of {1e3 * whole:.1f} ms, {rest / whole:.0%}.\n"
             )
     return "".join(lines)
 

@@ -1,7 +1,7 @@
-"""Where the time of `recipes/online_mujoco.py` goes: an iteration with N = 1, and its parts.
+"""Where the time of `recipes/online_mujoco.py` goes: an iteration and its parts.
 
-An iteration is a step of five environments and one update. What is neither acting nor the update is
-TorchRL's and the recipe's own overhead.
+With the paper's settings and with `--config-name fast`. An iteration is a step of five environments
+and one update. What is neither acting nor the update is TorchRL's and the recipe's own overhead.
 """
 
 from __future__ import annotations
@@ -20,15 +20,19 @@ from torchrl_aca.training.logging import MetricMeans
 torch.set_num_threads(int(os.environ.get("THREADS", os.cpu_count() or 1)))
 
 
-@pytest.fixture(scope="module", params=[False, True], ids=["eager", "compiled"])
+LOOPS = {
+    "paper, compiled": ("online_mujoco", "compile=true"),
+    "fast, eager": ("fast", "compile=false"),
+    "fast, compiled": ("fast", "compile=true"),
+}
+
+
+@pytest.fixture(scope="module", params=LOOPS)
 def loop(request):
     """The parts of a training loop after its warm-up, and the name of the variant."""
     torch._dynamo.reset()
-    cfg = configure(
-        "aca.num_target_candidates=1",
-        f"compile={request.param}",
-        "collector.warmup_frames=500",
-    )
+    name, override = LOOPS[request.param]
+    cfg = configure(override, "collector.warmup_frames=500", name=name)
     env = make_vector_env(cfg.env.name, cfg.collector.num_envs, seed=0)
     agent = make_recipe_agent(cfg, env)
     collection = Collection(env, agent.policy, cfg.collector)
@@ -36,15 +40,17 @@ def loop(request):
     batches = iter(collection)
     for _ in range(110):
         buffer.extend(transitions(next(batches)))
-    yield env, agent, batches, buffer, "compiled" if request.param else "eager"
+    yield env, agent, batches, buffer, request.param
     collection.close()
 
 
-def measure(benchmark, call, part: str, variant: str) -> None:
-    """Times `call`; two calls before that compile it where it is compiled."""
-    info = {"case": f"iteration, N = 1: {part}", "variant": variant, "rows": 0, "flops": 0}
+def measure(benchmark, call, part: str, loop: str) -> None:
+    """Times `call`; the calls before that compile it where it is compiled."""
+    settings, variant = loop.split(", ")
+    info = {"case": f"iteration, {settings}: {part}", "variant": variant, "rows": 0, "flops": 0}
     benchmark.extra_info.update({**info, "threads": torch.get_num_threads()})
-    benchmark.pedantic(call, rounds=60, warmup_rounds=4, iterations=1)
+    rounds = 12 if settings == "paper" else 60
+    benchmark.pedantic(call, rounds=rounds, warmup_rounds=4, iterations=1)
 
 
 def test_whole_iteration(benchmark, loop):
@@ -75,6 +81,16 @@ def test_update(benchmark, loop):
     measure(benchmark, lambda: agent.update(batch), "update", variant)
 
 
+def test_update_without_its_chain(benchmark, loop, monkeypatch):
+    """Losses, backward passes, Adam and targets: the next actions are there beforehand."""
+    _, agent, _, buffer, variant = loop
+    batch = buffer.sample()
+    loss = agent.state["loss"]
+    action = loss.sample_next_action(batch)
+    monkeypatch.setattr(loss, "sample_next_action", lambda batch: action)
+    measure(benchmark, lambda: agent.update(batch), "update without its chain", variant)
+
+
 def test_buffer(benchmark, loop):
     *_, batches, buffer, variant = loop
     rows = transitions(next(batches))
@@ -92,7 +108,7 @@ def test_collector_without_a_policy(benchmark):
     env = make_vector_env(cfg.env.name, cfg.collector.num_envs, seed=0)
     collection = Collection(env, make_recipe_agent(cfg, env).policy, cfg.collector)
     batches = iter(collection)
-    measure(benchmark, lambda: next(batches), "collector and environments, random actions", "eager")
+    measure(benchmark, lambda: next(batches), "collector, random actions", "any, eager")
     collection.close()
 
 
@@ -106,4 +122,4 @@ def test_environments_alone(benchmark):
         for copy, each in zip(copies, action, strict=True):
             copy.step(each)
 
-    measure(benchmark, step, "environments alone", "eager")
+    measure(benchmark, step, "environments alone", "any, eager")

@@ -141,8 +141,8 @@ def test_acting(benchmark, num_states, num_candidates, variant):
     sampling(benchmark, "HalfCheetah", num_states, num_candidates, variant, case)
 
 
-@pytest.mark.parametrize("num_inference_steps", [20, 10, 5])
-def test_strides(benchmark, num_inference_steps):
+@pytest.mark.parametrize("num_inference_steps", [20, 8, 6])
+def test_short_chains(benchmark, num_inference_steps):
     observation = torch.randn(BATCH, SIZES["HalfCheetah"][0])
     actor = make_actor("HalfCheetah", "compiled", 1, num_inference_steps=num_inference_steps)
     case = f"HalfCheetah: target actions, {BATCH} states x 1, chain of {num_inference_steps} steps"

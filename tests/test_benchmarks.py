@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import re
+
+import pytest
 import torch
 
+import gpu
 from report import loop_overhead, table
 from torchrl_aca import CriticGuidedDenoisingActor, NoiseLevelCritic, NoiseSchedule
 from torchrl_aca.interop import load_official
@@ -61,10 +65,31 @@ def test_the_report_divides_by_yardstick_and_roofline():
 
 def test_the_report_tells_what_the_loop_costs():
     def part(name, seconds, variant="compiled"):
-        info = {"case": f"iteration, N = 1: {name}", "variant": variant}
+        info = {"case": f"iteration, fast: {name}", "variant": variant}
         return {"extra_info": info, "stats": {"median": seconds}}
 
     results = [part("whole", 0.1), part("acting, 5 states x 32", 0.03), part("update", 0.06)]
-    assert "(compiled)" in loop_overhead(results)
+    assert "iteration, fast (compiled)" in loop_overhead(results)
     assert "takes 10.0 of 100.0 ms, 10%" in loop_overhead(results)
     assert loop_overhead([part("update", 0.06), part("whole", 0.1)]) == ""
+
+
+def test_the_gpu_command_times_what_works_and_tells_what_does_not(tmp_path, monkeypatch):
+    torch.set_num_threads(1)
+    arguments = ["--device", "cpu", "--no-tests", "--updates", "0", "--rounds", "1"]
+    cases = ["--tasks", "inverted_pendulum", "--candidates", "1", "--variants", "eager", "broken"]
+    monkeypatch.setitem(gpu.VARIANTS, "broken", ["device=nonsense"])
+    assert gpu.main([*arguments, *cases, "--out", str(tmp_path)]) == 0
+    *_, works, fails = (tmp_path / "speed.md").read_text().splitlines()
+    assert re.fullmatch(
+        r"\| inverted_pendulum \| 1 \| eager \| \d+\.\d\d ms \| \d+\.\d\d ms \| \d+ \|", works
+    )
+    assert fails.startswith(
+        "| inverted_pendulum | 1 | broken | failed: RunError: device='nonsense'"
+    )
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU would be used")
+def test_without_a_gpu_the_command_says_so(tmp_path):
+    with pytest.raises(SystemExit, match="expected a CUDA device, found none"):
+        gpu.main(["--out", str(tmp_path)])
