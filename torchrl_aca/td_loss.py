@@ -155,6 +155,11 @@ class TDLoss(LossModule):
         clone._tie()
         return clone
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """A pickle holds parameters and their networks, and not that they are the same."""
+        super().__setstate__(state)
+        self._tie()
+
     def _apply(self, fn: Callable) -> Any:
         """Casts and moves make new buffers, in the loss and in its parts: tie them again."""
         super()._apply(fn)
