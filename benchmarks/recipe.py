@@ -21,7 +21,7 @@ CONFIGS = Path(__file__).resolve().parents[1] / "recipes/configs"
 def configure(*overrides: str, name: str = "online_mujoco") -> RunConfig:
     """The configuration of `python recipes/online_mujoco.py --config-name NAME OVERRIDES`."""
     with hydra.initialize_config_dir(str(CONFIGS), version_base="1.3"):
-        return configured(hydra.compose(name, ["algo=aca", *overrides]))
+        return configured(hydra.compose(name, list(overrides)))
 
 
 def make_recipe_agent(cfg: RunConfig, env: EnvBase, device: str | torch.device = "cpu") -> Agent:

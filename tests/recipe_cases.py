@@ -40,6 +40,18 @@ TINY_SIZES = {
         "aca.num_target_candidates=2",
         "aca.alpha_interval=20",
     ],
+    "qsm": [
+        "qsm.num_cells=[16,16]",
+        "qsm.num_steps=3",
+        "qsm.num_candidates=3",
+        "qsm.num_target_candidates=2",
+    ],
+    "qvpo": [
+        "qvpo.num_cells=[16,16]",
+        "qvpo.num_steps=3",
+        "qvpo.num_candidates=3",
+        "qvpo.num_target_candidates=2",
+    ],
     "rlpd": [
         "rlpd.num_cells=[16,16]",
         "rlpd.num_qvalue_nets=3",
@@ -47,6 +59,14 @@ TINY_SIZES = {
         "optim.utd_ratio=0.4",
     ],
     "sac": ["sac.num_cells=[16,16]"],
+    "sdac": [
+        "sdac.num_cells=[16,16]",
+        "sdac.num_steps=3",
+        "sdac.num_candidates=3",
+        "sdac.num_target_candidates=2",
+        "sdac.num_proposals=4",
+        "sdac.alpha_interval=20",
+    ],
 }
 TINY = {algo: [f"algo={algo}", *TINY_RUN, *sizes] for algo, sizes in TINY_SIZES.items()}
 

@@ -13,9 +13,24 @@ from torch import nn
 from torchrl.modules import ValueOperator
 from torchrl.objectives import HardUpdate, SoftUpdate
 
-from loss_cases import ACTION_DIM, CASES, OBSERVATION_DIM, make_actor, make_policy
+from loss_cases import (
+    ACTION_DIM,
+    CASES,
+    LANGEVIN,
+    OBSERVATION_DIM,
+    make_actor,
+    make_diffusion_policy,
+    make_policy,
+)
 from torchrl_aca import ACALoss
-from torchrl_aca.baselines import EnsembleMLP, EnsembleSACLoss
+from torchrl_aca.baselines import (
+    EnsembleMLP,
+    EnsembleSACLoss,
+    QSMLoss,
+    QVPOLoss,
+    SDACLoss,
+    TwinCritic,
+)
 
 NEXT_KEYS = ("reward", "done", "terminated")
 COPIES = {"deepcopy": copy.deepcopy, "pickle": lambda loss: pickle.loads(pickle.dumps(loss))}
@@ -49,6 +64,11 @@ def assert_tied(loss):
     for named in (loss.named_parameters, loss.named_buffers):
         tensors = [tensor.data_ptr() for _, tensor in named()]
         assert len(tensors) == len(set(tensors))
+    if hasattr(loss, "average_actor_network"):
+        average, targets = loss.average_actor_network, loss.target_policy_network_params
+        tied = {p.data_ptr() for p in average.network.parameters()}
+        assert tied == {p.data_ptr() for p in targets.values(True, True)}
+        assert average.critic is network and average.log_alpha is loss.actor_network.log_alpha
     if isinstance(loss, ACALoss):
         actor = loss.actor_network
         assert actor.critic is network and actor.log_alpha is loss.log_alpha
@@ -180,9 +200,10 @@ def test_keyword_arguments_give_what_a_tensordict_gives(case, reduction):
 def test_select_out_keys_leaves_the_chosen_ones(case):
     loss, data = case.make(), case.data(6)
     expected = seeded(loss, data.select(*loss.in_keys))
-    loss.select_out_keys("loss_qvalue", "alpha")
-    value, alpha = seeded(lambda: loss(**as_kwargs(loss, data)))
-    assert (value, alpha) == (expected["loss_qvalue"], expected["alpha"])
+    chosen = "loss_qvalue", min(case.metrics)
+    loss.select_out_keys(*chosen)
+    values = seeded(lambda: loss(**as_kwargs(loss, data)))
+    assert values == tuple(expected[key] for key in chosen)
 
 
 IN_KEYS = [(name, key) for name in CASES for key in CASES[name].make().in_keys]
@@ -314,9 +335,27 @@ class ShiftedEnsemble(EnsembleMLP):
         return super().forward(*inputs) + self.shift
 
 
+class ShiftedTwin(TwinCritic):
+    """Critics of a diffusion policy whose values are shifted by a buffer."""
+
+    def __init__(self, *sizes, **kwargs):
+        super().__init__(*sizes, **kwargs)
+        self.register_buffer("shift", torch.zeros(2, dtype=torch.float64))
+
+    def evaluate(self, features, action):
+        return super().evaluate(features, action) + self.shift
+
+
+DIFFUSION = {"qsm": QSMLoss, "qvpo": QVPOLoss, "sdac": SDACLoss}
+
+
 def make_shifted(name):
     if name == "aca":
         return ACALoss(make_actor(ShiftedCritic(), action_dim=ACTION_DIM))
+    if name in DIFFUSION:
+        critic = ShiftedTwin(OBSERVATION_DIM, ACTION_DIM, num_cells=(6,), dtype=torch.float64)
+        chain = LANGEVIN if name == "qsm" else None
+        return DIFFUSION[name](make_diffusion_policy(critic=critic, chain=chain), reward_scale=1.0)
     critics = ValueOperator(ShiftedEnsemble(), in_keys=["observation", "action"])
     return EnsembleSACLoss(make_policy(), critics)
 
@@ -378,9 +417,10 @@ def test_batch_norm_of_a_critic_counts_online_rows_and_serves_the_targets():
 # --- compilation ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("name", "given"), [("aca", ()), ("aca", ("noise", "noise_level", "next_action")), ("rlpd", ())]
-)
+COMPILED = [("aca", ("noise", "noise_level", "next_action")), *((name, ()) for name in CASES)]
+
+
+@pytest.mark.parametrize(("name", "given"), COMPILED)
 def test_compiled_losses_equal_eager_ones(name, given):
     case = CASES[name]
     loss, data = case.make(), case.data(4)

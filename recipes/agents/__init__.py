@@ -14,8 +14,13 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from agents.aca import ACAOptim, ACASettings, make_aca
-from agents.rlpd import RLPDOptim, RLPDSettings, Variant, make_rlpd
+from agents.diffusion import DiffusionOptim
+from agents.qsm import QSMSettings, make_qsm
+from agents.qvpo import QVPOSettings, make_qvpo
+from agents.rlpd import RLPDOptim, RLPDSettings, make_rlpd
 from agents.sac import SACOptim, SACSettings, make_sac
+from agents.sdac import SDACOptim, SDACSettings, make_sdac
+from agents.variant import Variant
 from torchrl_aca.errors import RunError
 from torchrl_aca.training.agent import Agent
 from torchrl_aca.training.checkpoint import read_checkpoint, restore
@@ -38,8 +43,11 @@ class Method:
 
 AGENTS = {
     "aca": Method(make_aca, {"aca": ACASettings, "optim": ACAOptim}),
+    "qsm": Method(make_qsm, {"qsm": QSMSettings, "variant": Variant, "optim": DiffusionOptim}),
+    "qvpo": Method(make_qvpo, {"qvpo": QVPOSettings, "variant": Variant, "optim": DiffusionOptim}),
     "rlpd": Method(make_rlpd, {"rlpd": RLPDSettings, "variant": Variant, "optim": RLPDOptim}),
     "sac": Method(make_sac, {"sac": SACSettings, "optim": SACOptim}),
+    "sdac": Method(make_sdac, {"sdac": SDACSettings, "optim": SDACOptim}),
 }
 
 Recipe = TypeVar("Recipe", bound=RunConfig)
