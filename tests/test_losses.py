@@ -180,9 +180,9 @@ def test_keyword_arguments_give_what_a_tensordict_gives(case, reduction):
 def test_select_out_keys_leaves_the_chosen_ones(case):
     loss, data = case.make(), case.data(6)
     expected = seeded(loss, data.select(*loss.in_keys))
-    loss.select_out_keys("loss_qvalue", "alpha")
-    value, alpha = seeded(lambda: loss(**as_kwargs(loss, data)))
-    assert (value, alpha) == (expected["loss_qvalue"], expected["alpha"])
+    loss.select_out_keys("loss_qvalue", "pred_value")
+    out = seeded(lambda: loss(**as_kwargs(loss, data)))
+    assert out == (expected["loss_qvalue"], expected["pred_value"])
 
 
 IN_KEYS = [(name, key) for name in CASES for key in CASES[name].make().in_keys]
@@ -326,7 +326,7 @@ def shift_of(loss):
     return shift
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", ["aca", "rlpd"])
 def test_buffers_stay_tied_through_casts_and_copies(name):
     loss = make_shifted(name)
     assert_tied(loss)
@@ -336,7 +336,7 @@ def test_buffers_stay_tied_through_casts_and_copies(name):
 
 
 @pytest.mark.parametrize("cast", [False, True])
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", ["aca", "rlpd"])
 def test_targets_take_over_the_online_buffers(name, cast):
     loss = make_shifted(name)
     updater = SoftUpdate(loss, tau=0.1)
@@ -379,7 +379,12 @@ def test_batch_norm_of_a_critic_counts_online_rows_and_serves_the_targets():
 
 
 @pytest.mark.parametrize(
-    ("name", "given"), [("aca", ()), ("aca", ("noise", "noise_level", "next_action")), ("rlpd", ())]
+    ("name", "given"),
+    [
+        ("aca", ()),
+        ("aca", ("noise", "noise_level", "next_action")),
+        *((name, ()) for name in CASES if name != "aca"),
+    ],
 )
 def test_compiled_losses_equal_eager_ones(name, given):
     case = CASES[name]
