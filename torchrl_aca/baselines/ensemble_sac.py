@@ -126,8 +126,8 @@ class EnsembleSACLoss(EnsembleTDLoss):
 
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
-    loss_names = ("loss_qvalue", "loss_actor", "loss_alpha")
-    metric_names = ("pred_value", "target_value", "entropy", "alpha")
+    loss_names: tuple[str, ...] = ("loss_qvalue", "loss_actor", "loss_alpha")
+    metric_names: tuple[str, ...] = ("pred_value", "target_value", "entropy", "alpha")
 
     target_entropy: Tensor
 
