@@ -105,7 +105,7 @@ class EnsembleCQLLoss(EnsembleSACLoss):
 
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
-    metric_names = ("pred_value", "target_value", "cql_gap", "entropy", "alpha")
+    metric_names: tuple[str, ...] = ("pred_value", "target_value", "cql_gap", "entropy", "alpha")
 
     _low: Tensor
     _high: Tensor
