@@ -14,6 +14,16 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from agents.aca import ACAOptim, ACASettings, make_aca
+from agents.cql import (
+    CalQLSettings,
+    CQLOptim,
+    CQLSettings,
+    WSRLSettings,
+    make_calql,
+    make_cql,
+    make_wsrl,
+)
+from agents.iql import IQLOptim, IQLSettings, make_iql
 from agents.rlpd import RLPDOptim, RLPDSettings, Variant, make_rlpd
 from agents.sac import SACOptim, SACSettings, make_sac
 from torchrl_aca.errors import RunError
@@ -30,16 +40,24 @@ class Method:
     Attributes:
         make: Builds the agent from a typed configuration, an environment and a device.
         sections: The sections of a configuration that are the method's own, by name.
+        starts_from: Other methods with the same offline phase, whose runs it can go on from.
     """
 
     make: Callable[[Any, EnvBase, torch.device], Agent]
     sections: Mapping[str, type[Section]]
+    starts_from: tuple[str, ...] = ()
 
 
 AGENTS = {
     "aca": Method(make_aca, {"aca": ACASettings, "optim": ACAOptim}),
     "rlpd": Method(make_rlpd, {"rlpd": RLPDSettings, "variant": Variant, "optim": RLPDOptim}),
     "sac": Method(make_sac, {"sac": SACSettings, "optim": SACOptim}),
+    "cql": Method(make_cql, {"cql": CQLSettings, "optim": CQLOptim}, ("wsrl",)),
+    "iql": Method(make_iql, {"iql": IQLSettings, "optim": IQLOptim}),
+    "calql": Method(make_calql, {"cql": CQLSettings, "calql": CalQLSettings, "optim": CQLOptim}),
+    "wsrl": Method(
+        make_wsrl, {"cql": CQLSettings, "wsrl": WSRLSettings, "optim": CQLOptim}, ("cql",)
+    ),
 }
 
 Recipe = TypeVar("Recipe", bound=RunConfig)

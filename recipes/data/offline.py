@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import hydra
 import torch
 from omegaconf.errors import OmegaConfBaseException
-from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase
 
 from agents import without_methods
@@ -20,6 +19,7 @@ from torchrl_aca.offline.layout import METADATA_FILE, sha256
 from torchrl_aca.offline.registry import ROOT
 from torchrl_aca.offline.scores import Scores
 from torchrl_aca.replay import TRANSITION_KEYS, MixedReplayBuffer, make_replay_buffer
+from torchrl_aca.training.agent import Agent
 from torchrl_aca.training.config import checked
 from torchrl_aca.training.envs import task_name
 
@@ -50,7 +50,7 @@ def dataset_path(cfg: Any) -> Path:
 
 def needs_data(cfg: Any) -> bool:
     """Whether there are minibatches with rows of the data set, in the online phase or before."""
-    return bool(cfg.offline_fraction or cfg.optim.offline_updates)
+    return bool(cfg.offline_fraction or (cfg.optim.offline_updates and cfg.pretrained is None))
 
 
 def generate_missing(cfg: Any) -> None:
@@ -131,16 +131,18 @@ def task_scores(cfg: Any) -> Scores | None:
     return reference_scores(cfg.env.name)
 
 
-def make_mixture(
-    cfg: Any, dataset: OfflineDataset | None, extra_keys: Sequence[NestedKey] = ()
-) -> MixedReplayBuffer:
-    """The buffer that minibatches are drawn from. The loss scales the rewards of both halves."""
+def make_mixture(cfg: Any, dataset: OfflineDataset | None, agent: Agent) -> MixedReplayBuffer:
+    """The buffer that minibatches are drawn from. The loss scales the rewards of both halves.
+
+    Raises:
+        DatasetError: If the data lack what the agent needs in a row.
+    """
     return MixedReplayBuffer(
-        None if dataset is None else dataset.data,
+        None if dataset is None else agent.offline_rows_of(dataset.data),
         make_replay_buffer(cfg.buffer.capacity, cfg.optim.batch_size),
         offline_fraction=cfg.offline_fraction,
         batch_size=cfg.optim.batch_size,
-        keys=(*TRANSITION_KEYS, *extra_keys),
+        keys=(*TRANSITION_KEYS, *agent.extra_keys),
         seed=cfg.seed,
     )
 
