@@ -63,7 +63,7 @@ def record(
     bound=1.0,
     seed=0,
     reference_scores=None,
-    last_step=39,
+    complete=True,
 ) -> Path:
     """Three episodes of noise with rewards that no online transition has."""
     random = np.random.default_rng(seed)
@@ -76,7 +76,8 @@ def record(
                 states[1:],
                 MARK + random.uniform(1, 2, 40),
                 np.zeros(40, bool),
-                np.arange(40) == last_step,
+                np.arange(40) == 39,
+                complete=complete,
             )
         writer.finish(name="noise", env_id=env_id, reference_scores=reference_scores)
     return path

@@ -96,6 +96,14 @@ RIVALS = [
     ("algo=rlpd", "rlpd.init=zeros", "rlpd.init='zeros': expected 'xavier_uniform' or"),
     ("algo=rlpd", "optim.actor_lr=0", "optim.actor_lr=0: expected greater than 0"),
     ("algo=rlpd", "rlpd.actor_interval=0.5", "rlpd.actor_interval=0.5: expected a valid integer"),
+    ("algo=cql", "cql.subset_size=11", r"at most cql.num_qvalue_nets \(10\)"),
+    ("algo=cql", "cql.log_std_max=-20", r"expected at least cql.log_std_min"),
+    ("algo=cql", "cql.weight=-1", "cql.weight=-1.0: expected greater than or equal to 0"),
+    ("algo=cql", "cql.num_actions=0", "cql.num_actions=0: expected greater than or equal to 1"),
+    ("algo=calql", "calql.tail=none", "calql.tail='none': expected 'truncate', 'mask' or"),
+    ("algo=wsrl", "wsrl.actor_interval=0", "wsrl.actor_interval=0: expected greater than"),
+    ("algo=iql", "iql.expectile=1", "iql.expectile=1.0: expected less than 1"),
+    ("algo=iql", "iql.subset_size=11", r"at most iql.num_qvalue_nets \(10\)"),
     ("algo=sac", "sac.activation=Foo", "sac.activation='Foo': expected the name of an activation"),
     ("algo=sac", "sac.activation=functional", "sac.activation='functional'"),
     ("algo=sac", "sac.num_cells=[0]", "sac.num_cells.0=0"),
@@ -124,6 +132,8 @@ def test_a_mistake_in_a_rival_is_told_as_well(algo, override, message):
         ("online_frames=0", "online_frames=0: expected greater than or equal to 1"),
         ("online_frames=abc", "online_frames='abc'"),
         ("generate=yes", "generate='yes': expected a valid dictionary"),
+        ("offline_updates=-1", "offline_updates=-1: expected greater than or equal to 0"),
+        ("pretrained=5", "pretrained=5: expected a valid string"),
     ],
 )
 def test_a_mistake_in_the_recipe_with_offline_data_is_told(override, message):

@@ -119,6 +119,16 @@ def require_fit(cfg: Any, metadata: Mapping[str, Any], env: EnvBase) -> None:
         )
 
 
+def require_whole_episodes(cfg: Any, metadata: Mapping[str, Any]) -> None:
+    """Raises `RunError` if no episode of a data set has an end of its own."""
+    if len(metadata["incomplete_episodes"]) == metadata["episodes"]:
+        raise RunError(
+            f"dataset={cfg.dataset} has no episode with an end of its own, so what came after its "
+            f"rows is unknown; algo={cfg.algo.name} needs returns to go. Import the data with "
+            "their terminals and time limits, or take algo=cql."
+        )
+
+
 def task_scores(cfg: Any) -> Scores | None:
     """The returns that count as 0 and 100: the data set's, or else those known for the task.
 
@@ -135,8 +145,10 @@ def make_mixture(cfg: Any, dataset: OfflineDataset | None, agent: Agent) -> Mixe
     """The buffer that minibatches are drawn from. The loss scales the rewards of both halves.
 
     Raises:
-        DatasetError: If the data lack what the agent needs in a row.
+        RunError: If the agent needs whole episodes, and the recording has cut every one.
     """
+    if dataset is not None and agent.offline_rows:
+        require_whole_episodes(cfg, dataset.metadata)
     return MixedReplayBuffer(
         None if dataset is None else agent.offline_rows_of(dataset.data),
         make_replay_buffer(cfg.buffer.capacity, cfg.optim.batch_size),
