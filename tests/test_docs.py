@@ -159,8 +159,9 @@ def table_rows(page: str, section: str = "") -> list[list[str]]:
 
 def test_config_page_has_every_key_with_its_default():
     files = [*sorted((CONFIGS / "algo").glob("*.yaml"))]
-    assert [file.stem for file in files] == ["aca", "rlpd", "sac"]
-    configs = [flat(composed(f"algo={name}")) for name in ("aca", "sac", "rlpd")]
+    names = ("aca", "sac", "rlpd", "cql", "calql", "wsrl", "iql")
+    assert {file.stem for file in files} == {*names, "rlpd_wsrl"}  # which is a variant of RLPD
+    configs = [flat(composed(f"algo={name}")) for name in names]
     documented: dict[str, list[object]] = {}
     for key, default, *_ in table_rows("config.md"):
         documented.setdefault(key.strip("`"), []).append(yaml.safe_load(default.strip("`")))
@@ -220,7 +221,11 @@ def runs(tmp_path_factory):
         "aca": ["aca.num_candidates=2", "aca.num_target_candidates=2"],
         "sac": [],
         "rlpd": ["optim.utd_ratio=1"],
+        "cql": ["cql.gap_threshold=5"],
+        "calql": [],
+        "iql": [],
     }
+    section = {"calql": "cql"}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         return {
@@ -229,7 +234,7 @@ def runs(tmp_path_factory):
                     f"algo={algorithm}",
                     "env=reacher",
                     f"run_dir={folder / algorithm}",
-                    f"{algorithm}.num_cells=[8]",
+                    f"{section.get(algorithm, algorithm)}.num_cells=[8]",
                     "collector.warmup_frames=250",
                     "optim.batch_size=8",
                     "optim.total_updates=2",
