@@ -168,6 +168,16 @@ def test_it_has_the_parameters_of_the_papers_table(algo):
     assert counted - temperature == HUMANOID_PARAMETERS[algo]
 
 
+@pytest.mark.parametrize(
+    ("algo", "temperatures"), [("rlpd", 1), ("cql", 1), ("calql", 1), ("wsrl", 1), ("iql", 0)]
+)
+def test_its_page_has_its_parameter_count(algo, temperatures):
+    agent = built(algo, env="humanoid", tiny=False)
+    counted = sum(p.numel() for p in agent.state["loss"].parameters() if p.requires_grad)
+    page = (CONFIGS.parents[1] / "docs" / "methods" / f"{algo}.md").read_text()
+    assert f"{counted - temperatures:,}" in page
+
+
 @pytest.mark.parametrize("algo", ["sac", "rlpd"])
 def test_the_entropy_target_is_meant_for_actions_between_minus_one_and_one(algo):
     """A unit Gaussian policy of std s on [-0.4, 0.4] has the entropy of s / 0.4 on [-1, 1]."""
