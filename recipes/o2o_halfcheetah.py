@@ -2,12 +2,14 @@
 
     python recipes/o2o_halfcheetah.py dataset=datasets/halfcheetah-medium_replay algo=aca seed=1
     python recipes/o2o_halfcheetah.py dataset=datasets/halfcheetah-medium_replay algo=rlpd utd=20
+    python recipes/o2o_halfcheetah.py dataset=datasets/halfcheetah-medium_replay algo=wsrl
     python recipes/o2o_halfcheetah.py --config-name o2o_quickstart
     python recipes/o2o_halfcheetah.py resume=runs/<directory>
 
 Each minibatch of the online phase is partly from a fixed data set. A run has up to three phases: an
 offline one on the data set alone, which ACA and RLPD do not have, a warm-up without updates, and an
-online one. Every key is in `configs/o2o_halfcheetah.yaml`.
+online one. `pretrained=RUN_DIR` takes the first from another run. Every key is in
+`configs/o2o_halfcheetah.yaml`, what each method does in `configs/phases/`.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ from pydantic import Field, model_validator
 
 import renderer  # noqa: F401
 from agents import configured, make_agent
+from agents.pretrained import require_offline_phase, start_from
 from data.offline import (
     generate_missing,
     load_offline_data,
@@ -30,7 +33,6 @@ from data.offline import (
     task_scores,
 )
 from torchrl_aca.offline.scores import normalized_score
-from torchrl_aca.replay import transitions
 from torchrl_aca.training.collection import Collection
 from torchrl_aca.training.config import Count, RunConfig, Share, is_number
 from torchrl_aca.training.envs import make_vector_env
@@ -46,6 +48,8 @@ class OfflineToOnlineConfig(RunConfig):
 
     dataset: str | None
     generate: dict[str, Any] | None
+    offline_updates: Annotated[int, Field(ge=0, le=10**12)]
+    pretrained: str | None
     offline_fraction: Share
     utd: Annotated[float, Field(ge=1e-4, le=1e4)]
     online_frames: Count
@@ -71,13 +75,18 @@ def train(cfg: DictConfig, checkpoint: dict[str, Any] | None = None) -> Path:
     env = make_vector_env(cfg.env.name, cfg.collector.num_envs, cfg.seed)
     eval_env = make_eval_env(cfg.env.name, cfg.eval)
     agent = make_agent(cfg, env, device)
+    require_offline_phase(cfg, agent)
     dataset, scores = load_offline_data(cfg, env), task_scores(cfg)
-    buffer = make_mixture(cfg, dataset, agent.extra_keys)
+    buffer = make_mixture(cfg, dataset, agent)
     collection = Collection(env, agent.policy, cfg.collector, device)
     facts = {
         **offline_facts(dataset, buffer),
         "updates per online frame": f"{cfg.optim.utd_ratio:g}",
     }
+
+    pretrained = 0
+    if cfg.pretrained is not None and checkpoint is None:
+        pretrained = cfg.optim.offline_updates = start_from(cfg, agent, facts)
 
     def evaluation() -> dict[str, float]:
         result = evaluate(agent.policy, eval_env, cfg.eval.seed, device)
@@ -95,13 +104,15 @@ def train(cfg: DictConfig, checkpoint: dict[str, Any] | None = None) -> Path:
         device=device,
         script=__file__,
         facts=facts,
+        pretrained=pretrained,
     ) as run:
         buffer.offline_fraction = 1.0
         for batch in run.offline_phase(buffer):
             run.add(agent.offline_update(batch))
         buffer.offline_fraction = cfg.offline_fraction
         for data in collection:  # of shape (num_envs, steps)
-            buffer.extend(transitions(data, agent.extra_keys))
+            if len(rows := agent.rows_of(data)):
+                buffer.extend(rows)
             for batch in run.due(buffer):
                 run.add(agent.update(batch))
             if run.end_iteration():

@@ -21,7 +21,7 @@ from omegaconf import DictConfig
 
 import renderer  # noqa: F401
 from agents import configured, make_agent
-from torchrl_aca.replay import make_replay_buffer, transitions
+from torchrl_aca.replay import make_replay_buffer
 from torchrl_aca.training.collection import Collection
 from torchrl_aca.training.envs import make_vector_env
 from torchrl_aca.training.evaluation import evaluate, make_eval_env, report_extras
@@ -49,7 +49,8 @@ def train(cfg: DictConfig, checkpoint: dict[str, Any] | None = None) -> Path:
         cfg, agent, buffer, collection, evaluation, checkpoint, device=device, script=__file__
     ) as run:
         for data in collection:  # of shape (num_envs, steps)
-            buffer.extend(transitions(data, agent.extra_keys))
+            if len(rows := agent.rows_of(data)):
+                buffer.extend(rows)
             for batch in run.due(buffer):
                 run.add(agent.update(batch))
             if run.end_iteration():

@@ -10,12 +10,22 @@ from tensordict import TensorDict, is_tensor_collection
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.data import Bounded
-from torchrl.modules import MLP, NormalParamExtractor, ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.modules import (
+    MLP,
+    IndependentNormal,
+    NormalParamExtractor,
+    ProbabilisticActor,
+    TanhNormal,
+    ValueOperator,
+)
 from torchrl.objectives import SoftUpdate
 
 from torchrl_aca import ACALoss, CriticGuidedDenoisingActor, NoiseLevelCritic, NoiseSchedule
 from torchrl_aca.baselines import (
+    CalQLLoss,
     DiffusionPolicy,
+    EnsembleCQLLoss,
+    EnsembleIQLLoss,
     EnsembleMLP,
     EnsembleSACLoss,
     NoiseNetwork,
@@ -115,12 +125,14 @@ def make_policy(state="observation", action="action", spec=True):
     )
 
 
-def make_rlpd(state="observation", action="action", policy=None, num_members=4, **kwargs):
-    """A loss with no parameter at a special value, and targets that differ from the critics."""
+def make_critics(state="observation", action="action", num_members=4):
     num_in = OBSERVATION_DIM + ACTION_DIM
     network = EnsembleMLP(num_in, num_members, num_cells=(6, 5), dtype=torch.float64)
-    critics = ValueOperator(network, in_keys=[state, action])
-    loss = EnsembleSACLoss(policy or make_policy(state, action), critics, **kwargs)
+    return ValueOperator(network, in_keys=[state, action])
+
+
+def spread(loss):
+    """No parameter of the critics at a special value, and targets that differ from them."""
     loss.make_value_estimator(gamma=0.875)
     SoftUpdate(loss, tau=0.1)
     for params in (loss.qvalue_network_params, loss.target_qvalue_network_params):
@@ -130,6 +142,15 @@ def make_rlpd(state="observation", action="action", policy=None, num_members=4, 
         last = params["module", "layers", "6"]
         last["bias"].data.zero_()
         last["weight"].data.sub_(last["weight"].data.mean(1, keepdim=True))
+    return loss
+
+
+def make_rlpd(
+    state="observation", action="action", policy=None, num_members=4, kind=EnsembleSACLoss, **kwargs
+):
+    """A loss with no parameter at a special value, and targets that differ from the critics."""
+    critics = make_critics(state, action, num_members)
+    loss = spread(kind(policy or make_policy(state, action), critics, **kwargs))
     loss.raw_alpha.data.fill_(0.3)
     return loss
 
@@ -205,6 +226,45 @@ def make_sdac(state="observation", action="action", policy=None, **kwargs):
     return make_diffusion_loss(SDACLoss, policy=policy, **{"num_proposals": 5, **kwargs})
 
 
+# --- CQL, Cal-QL, IQL -----------------------------------------------------------------------------
+
+
+def make_cql(*args, kind=EnsembleCQLLoss, **kwargs):
+    kwargs = {"num_actions": 3, "num_backup_actions": 2, "cql_weight": 0.6, **kwargs}
+    return make_rlpd(*args, kind=kind, **kwargs)
+
+
+def make_cql_with_threshold(*args, **kwargs):
+    return make_cql(*args, gap_threshold=0.7, **kwargs)
+
+
+def make_calql(*args, **kwargs):
+    return make_cql(*args, kind=CalQLLoss, **kwargs)
+
+
+def make_calql_data(*batch):
+    """Returns of the size of the values, so that some of these are above and some below."""
+    data = make_rlpd_data(*batch)
+    data["mc_return"] = 0.3 * torch.randn(*batch, 1, dtype=torch.float64)
+    return data
+
+
+def make_iql(state="observation", action="action", num_members=4, **kwargs):
+    network = nn.Sequential(
+        MLP(OBSERVATION_DIM, 2 * ACTION_DIM, num_cells=[8], activation_class=nn.ReLU).double(),
+        NormalParamExtractor(scale_mapping="exp"),
+    )
+    actor = ProbabilisticActor(
+        TensorDictModule(network, in_keys=[state], out_keys=["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        out_keys=[action],
+        distribution_class=IndependentNormal,
+    )
+    value = MLP(OBSERVATION_DIM, 1, num_cells=[8], activation_class=nn.ReLU).double()
+    critics = make_critics(state, action, num_members)
+    return spread(EnsembleIQLLoss(actor, critics, ValueOperator(value, in_keys=[state]), **kwargs))
+
+
 # --- all losses -----------------------------------------------------------------------------------
 
 
@@ -270,5 +330,33 @@ CASES = {
         ("qvalue_loss", "actor_loss", "alpha_loss"),
         frozenset({"pred_value", "target_value", "entropy", "alpha"}),
         frozenset({"policy_log_prob"}),
+    ),
+    "cql": LossCase(
+        make_cql,
+        make_rlpd_data,
+        ("qvalue_loss", "actor_loss", "alpha_loss"),
+        frozenset({"pred_value", "target_value", "cql_gap", "entropy", "alpha"}),
+        frozenset({"policy_log_prob", "cql_gap"}),
+    ),
+    "cql_with_threshold": LossCase(
+        make_cql_with_threshold,
+        make_rlpd_data,
+        ("qvalue_loss", "actor_loss", "alpha_loss", "cql_weight_loss"),
+        frozenset({"pred_value", "target_value", "cql_gap", "entropy", "alpha", "cql_weight"}),
+        frozenset({"policy_log_prob", "cql_gap"}),
+    ),
+    "calql": LossCase(
+        make_calql,
+        make_calql_data,
+        ("qvalue_loss", "actor_loss", "alpha_loss"),
+        frozenset({"pred_value", "target_value", "cql_gap", "bound_rate", "entropy", "alpha"}),
+        frozenset({"policy_log_prob", "cql_gap"}),
+    ),
+    "iql": LossCase(
+        make_iql,
+        make_rlpd_data,
+        ("value_loss", "qvalue_loss", "actor_loss"),
+        frozenset({"state_value", "pred_value", "target_value", "advantage_weight", "log_prob"}),
+        frozenset(),
     ),
 }

@@ -32,6 +32,7 @@ TINY_RUN = [
     "checkpoint.interval=25",
     "logger.interval=10",
 ]
+CQL_SIZES = ["cql.num_cells=[16,16]", "cql.num_qvalue_nets=3", "cql.num_actions=2"]
 TINY_SIZES = {
     "aca": [
         "aca.num_cells=[16,16]",
@@ -67,6 +68,10 @@ TINY_SIZES = {
         "sdac.num_proposals=4",
         "sdac.alpha_interval=20",
     ],
+    "cql": [*CQL_SIZES, "cql.gap_threshold=5", "optim.utd_ratio=0.2"],
+    "calql": [*CQL_SIZES, "calql.tail=mask", "calql.horizon=5", "optim.utd_ratio=0.2"],
+    "wsrl": [*CQL_SIZES, "wsrl.actor_interval=7", "optim.utd_ratio=0.4"],
+    "iql": ["iql.num_cells=[16,16]", "iql.num_qvalue_nets=3", "optim.utd_ratio=0.2"],
 }
 TINY = {algo: [f"algo={algo}", *TINY_RUN, *sizes] for algo, sizes in TINY_SIZES.items()}
 

@@ -41,6 +41,7 @@ HUMANOID_PARAMETERS = {
     "sdac": 707_395,
 }  # of the paper's table
 # What learns the bandit in seconds; the methods' own constants are slow and safe.
+CQL_BANDIT = ["optim.lr=1e-2", "optim.actor_lr=1e-2", "cql.alpha_init=0.3", "cql.weight=0.1"]
 BANDIT = {
     "aca": [
         "aca.num_cells=[64,64]",
@@ -59,6 +60,10 @@ BANDIT = {
     "rlpd": ["optim.lr=1e-2", "optim.actor_lr=1e-2", "rlpd.alpha_init=0.3"],
     "sac": ["optim.lr=1e-2", "sac.alpha_init=0.3", "sac.reward_scale=1"],
     "sdac": ["optim.lr=1e-2", "optim.actor_lr=1e-2", "sdac.num_candidates=32"],
+    "cql": [*CQL_BANDIT, "cql.gap_threshold=null"],
+    "calql": CQL_BANDIT,
+    "wsrl": [*CQL_BANDIT, "wsrl.actor_interval=1"],
+    "iql": ["optim.lr=1e-2"],
 }
 
 
@@ -73,13 +78,14 @@ def update(agent, numbers) -> list[TensorDict]:
     metrics = []
     for number in numbers:
         torch.manual_seed(number)  # what the loop's checkpoint restores
-        metrics.append(agent.update(batch_of(number)))
+        metrics.append(agent.update(agent.offline_rows_of(batch_of(number))))
     return metrics
 
 
 def test_the_battery_covers_every_algorithm_and_its_configuration():
     assert EVERY == sorted(TINY) == sorted(BANDIT)
-    assert sorted(path.stem for path in (CONFIGS / "algo").glob("*.yaml")) == EVERY
+    names = {path.stem for path in (CONFIGS / "algo").glob("*.yaml")}
+    assert names == {*EVERY, "rlpd_wsrl"}  # another name for a variant of RLPD
 
 
 @pytest.fixture(scope="module", params=VARIANTS, ids=lambda case: "-".join([case[0], *case[1]]))
@@ -151,7 +157,8 @@ def test_a_restored_agent_goes_on_as_if_never_stopped(algo):
 
 @pytest.mark.parametrize("algo", EVERY)
 def test_an_update_leaves_its_batch_as_it_is_and_gives_detached_numbers(algo):
-    agent, batch = built(algo), batch_of(0)
+    agent = built(algo)
+    batch = agent.offline_rows_of(batch_of(0))
     before = batch.clone()
     metrics = agent.update(batch)
     assert all(value.shape == () and not value.requires_grad for value in metrics.values())
@@ -179,6 +186,16 @@ def test_it_has_the_parameters_of_the_papers_table(algo):
     trained = [p for p in agent.state["loss"].parameters() if p.requires_grad]
     # The table counts networks: neither log alpha, which has no dimension, nor targets.
     assert sum(p.numel() for p in trained if p.ndim) == HUMANOID_PARAMETERS[algo]
+
+
+@pytest.mark.parametrize(
+    ("algo", "temperatures"), [("rlpd", 1), ("cql", 1), ("calql", 1), ("wsrl", 1), ("iql", 0)]
+)
+def test_its_page_has_its_parameter_count(algo, temperatures):
+    agent = built(algo, env="humanoid", tiny=False)
+    counted = sum(p.numel() for p in agent.state["loss"].parameters() if p.requires_grad)
+    page = (CONFIGS.parents[1] / "docs" / "methods" / f"{algo}.md").read_text()
+    assert f"{counted - temperatures:,}" in page
 
 
 @pytest.mark.parametrize("algo", ["sac", "rlpd"])

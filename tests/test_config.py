@@ -121,6 +121,14 @@ BESIDE = [
     ("algo=sdac", "sdac.initial_scale=0", "sdac.initial_scale=0: expected greater than 0"),
     ("algo=sdac", "sdac.actor_interval=0", "sdac.actor_interval=0: expected greater than or equal"),
     ("algo=sdac", "optim.lr_decay_end=10", r"expected at least optim.lr_decay_start \(25000"),
+    ("algo=cql", "cql.subset_size=11", r"at most cql.num_qvalue_nets \(10\)"),
+    ("algo=cql", "cql.log_std_max=-20", r"expected at least cql.log_std_min"),
+    ("algo=cql", "cql.weight=-1", "cql.weight=-1: expected greater than or equal to 0"),
+    ("algo=cql", "cql.num_actions=0", "cql.num_actions=0: expected greater than or equal to 1"),
+    ("algo=calql", "calql.tail=none", "calql.tail='none': expected 'truncate', 'mask' or"),
+    ("algo=wsrl", "wsrl.actor_interval=0", "wsrl.actor_interval=0: expected greater than"),
+    ("algo=iql", "iql.expectile=1", "iql.expectile=1: expected less than 1"),
+    ("algo=iql", "iql.subset_size=11", r"at most iql.num_qvalue_nets \(10\)"),
     ("algo=sac", "sac.activation=Foo", "sac.activation='Foo': expected the name of an activation"),
     ("algo=sac", "sac.activation=functional", "sac.activation='functional'"),
     ("algo=sac", "sac.num_cells=[0]", "sac.num_cells.0=0"),
@@ -149,6 +157,8 @@ def test_a_mistake_beside_another_setting_is_told_as_well(setting, override, mes
         ("online_frames=0", "online_frames=0: expected greater than or equal to 1"),
         ("online_frames=abc", "online_frames='abc'"),
         ("generate=yes", "generate='yes': expected a valid dictionary"),
+        ("offline_updates=-1", "offline_updates=-1: expected greater than or equal to 0"),
+        ("pretrained=5", "pretrained=5: expected a valid string"),
     ],
 )
 def test_a_mistake_in_the_recipe_with_offline_data_is_told(override, message):

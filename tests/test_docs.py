@@ -160,8 +160,10 @@ def table_rows(page: str, section: str = "") -> list[list[str]]:
 
 
 def test_config_page_has_every_key_with_its_default():
-    order = [*dict.fromkeys(["aca", "sac", "rlpd", *AGENTS])]  # the page's
-    configs = [flat(composed(f"algo={name}")) for name in order]
+    names = [*dict.fromkeys(["aca", "sac", "rlpd", *AGENTS])]  # the page's order
+    files = {file.stem for file in (CONFIGS / "algo").glob("*.yaml")}
+    assert files == {*names, "rlpd_wsrl"}  # which is a variant of RLPD
+    configs = [flat(composed(f"algo={name}")) for name in names]
     documented: dict[str, list[object]] = {}
     for key, default, *_ in table_rows("config.md"):
         documented.setdefault(key.strip("`"), []).append(yaml.safe_load(default.strip("`")))

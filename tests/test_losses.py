@@ -365,7 +365,7 @@ def shift_of(loss):
     return shift
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", ["aca", "rlpd"])
 def test_buffers_stay_tied_through_casts_and_copies(name):
     loss = make_shifted(name)
     assert_tied(loss)
@@ -375,7 +375,7 @@ def test_buffers_stay_tied_through_casts_and_copies(name):
 
 
 @pytest.mark.parametrize("cast", [False, True])
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", ["aca", "rlpd"])
 def test_targets_take_over_the_online_buffers(name, cast):
     loss = make_shifted(name)
     updater = SoftUpdate(loss, tau=0.1)

@@ -10,70 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-import o2o_halfcheetah
 from agents import AGENTS
-from recipe_cases import (
-    CONFIGS,
-    assert_same_state,
-    composed,
-    rows_of,
-    run,
-    without_time,
-)
+from o2o_cases import ALGORITHMS, MARK, TINY, record, run_o2o, settings
+from recipe_cases import assert_same_state, composed, rows_of, run, without_time
 from torchrl_aca.errors import RunError
-from torchrl_aca.offline import DatasetError, DatasetWriter
+from torchrl_aca.offline import DatasetError
 from torchrl_aca.offline.layout import sha256
-from torchrl_aca.training.resume import resumed_config
-
-SIZES = {"observation_dim": 11, "action_dim": 3}  # Hopper's
-MARK = 1000.0  # below every offline reward, above every online one
-TINY = [
-    "env=hopper",
-    "num_threads=1",
-    "online_frames=60",
-    "collector.warmup_frames=50",
-    "buffer.capacity=300",
-    "optim.batch_size=16",
-    "eval.interval=30",
-    "eval.episodes=2",
-    "checkpoint.interval=25",
-    "logger.interval=10",
-]
-ALGORITHMS = {
-    "aca": [
-        "algo=aca",
-        "aca.num_cells=[16,16]",
-        "aca.num_steps=3",
-        "aca.num_candidates=3",
-        "aca.num_target_candidates=2",
-        "aca.alpha_interval=20",
-    ],
-    "rlpd": ["algo=rlpd", "rlpd.num_cells=[16,16]", "rlpd.num_qvalue_nets=3"],
-    "wsrl": ["algo=rlpd", "variant=wsrl", "rlpd.num_cells=[16,16]", "rlpd.num_qvalue_nets=3"],
-}
-
-
-def record(
-    path: Path, env_id="Hopper-v4", sizes=SIZES, bound=1.0, seed=0, reference_scores=None
-) -> Path:
-    """Three episodes of noise with rewards that no online transition has."""
-    random = np.random.default_rng(seed)
-    with DatasetWriter(path, **sizes, action_bounds=(-bound, bound)) as writer:
-        for _ in range(3):
-            states = random.normal(size=(41, sizes["observation_dim"]))
-            writer.add_episode(
-                states[:-1],
-                random.uniform(-bound, bound, (40, sizes["action_dim"])),
-                states[1:],
-                MARK + random.uniform(1, 2, 40),
-                np.zeros(40, bool),
-                np.arange(40) == 39,
-            )
-        writer.finish(name="noise", env_id=env_id, reference_scores=reference_scores)
-    return path
 
 
 @pytest.fixture(scope="module")
@@ -81,28 +25,16 @@ def data(tmp_path_factory) -> Path:
     return record(tmp_path_factory.mktemp("data") / "noise")
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def train():
-    """The recipe without a process of its own: takes overrides, as the command does."""
-
-    def trainer(*overrides: str, name: str = "o2o_halfcheetah") -> Path:
-        with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-            cfg = compose(name, list(overrides))
-            if cfg.resume is None:
-                return o2o_halfcheetah.train(cfg)
-            return o2o_halfcheetah.train(*resumed_config(cfg, overrides))
-
-    return trainer
-
-
-def settings(data: Path, run_dir: Path, algo: str = "aca") -> list[str]:
-    return [*ALGORITHMS[algo], *TINY, f"dataset={data}", f"run_dir={run_dir}"]
+    """The recipe without a process of its own."""
+    return run_o2o
 
 
 # --- a run ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("algo", ALGORITHMS)
+@pytest.mark.parametrize("algo", ["aca", "rlpd", "rlpd_wsrl"])
 def test_the_command_trains_and_its_card_names_the_data(algo, data, tmp_path):
     code, output, errors = run(
         *settings(data, tmp_path / "here", algo), cwd=tmp_path, recipe="o2o_halfcheetah"
@@ -123,7 +55,7 @@ def test_the_command_trains_and_its_card_names_the_data(algo, data, tmp_path):
     assert OmegaConf.load(tmp_path / "here" / "config.yaml").optim.total_updates == 60
 
 
-@pytest.mark.parametrize("algo", ALGORITHMS)
+@pytest.mark.parametrize("algo", ["aca", "rlpd", "rlpd_wsrl"])
 def test_stop_and_resume_equals_never_stopping(algo, data, train, tmp_path):
     unbroken = train(*settings(data, tmp_path / "unbroken", algo))
     stopped = train(*settings(data, tmp_path / "here", algo), "optim.total_updates=34")

@@ -55,6 +55,10 @@ class TDLoss(LossModule):
     def _state_keys(self) -> list[NestedKey]:
         """Keys of what the networks see of a state."""
 
+    def _row_keys(self) -> list[NestedKey]:
+        """Keys of what a loss reads in a row besides the transition."""
+        return []
+
     @contextmanager
     def _critics(self, params: TensorDictBase) -> Iterator[Any]:
         """``qvalue_network`` on other parameters; its own return after an exception as well."""
@@ -172,7 +176,7 @@ class TDLoss(LossModule):
         if self._in_keys is None:
             keys, states = self.tensor_keys, self._state_keys()
             after = (keys.reward, keys.done, keys.terminated, *states)
-            self._in_keys = [keys.action, *states, *map(next_key, after)]
+            self._in_keys = [keys.action, *states, *self._row_keys(), *map(next_key, after)]
         return self._in_keys
 
     @in_keys.setter

@@ -14,7 +14,17 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from agents.aca import ACAOptim, ACASettings, make_aca
+from agents.cql import (
+    CalQLSettings,
+    CQLOptim,
+    CQLSettings,
+    WSRLSettings,
+    make_calql,
+    make_cql,
+    make_wsrl,
+)
 from agents.diffusion import DiffusionOptim
+from agents.iql import IQLOptim, IQLSettings, make_iql
 from agents.qsm import QSMSettings, make_qsm
 from agents.qvpo import QVPOSettings, make_qvpo
 from agents.rlpd import RLPDOptim, RLPDSettings, make_rlpd
@@ -35,10 +45,12 @@ class Method:
     Attributes:
         make: Builds the agent from a typed configuration, an environment and a device.
         sections: The sections of a configuration that are the method's own, by name.
+        starts_from: Other methods with the same offline phase, whose runs it can go on from.
     """
 
     make: Callable[[Any, EnvBase, torch.device], Agent]
     sections: Mapping[str, type[Section]]
+    starts_from: tuple[str, ...] = ()
 
 
 AGENTS = {
@@ -48,6 +60,12 @@ AGENTS = {
     "rlpd": Method(make_rlpd, {"rlpd": RLPDSettings, "variant": Variant, "optim": RLPDOptim}),
     "sac": Method(make_sac, {"sac": SACSettings, "optim": SACOptim}),
     "sdac": Method(make_sdac, {"sdac": SDACSettings, "optim": SDACOptim}),
+    "cql": Method(make_cql, {"cql": CQLSettings, "optim": CQLOptim}, ("wsrl",)),
+    "calql": Method(make_calql, {"cql": CQLSettings, "calql": CalQLSettings, "optim": CQLOptim}),
+    "wsrl": Method(
+        make_wsrl, {"cql": CQLSettings, "wsrl": WSRLSettings, "optim": CQLOptim}, ("cql",)
+    ),
+    "iql": Method(make_iql, {"iql": IQLSettings, "optim": IQLOptim}),
 }
 
 Recipe = TypeVar("Recipe", bound=RunConfig)

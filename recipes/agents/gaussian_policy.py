@@ -1,4 +1,4 @@
-"""The tanh-squashed Gaussian policy that several algorithms share, and its units."""
+"""Gaussian policies: the tanh-squashed one that several algorithms share, and a clipped one."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import torch
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.data import Bounded
-from torchrl.modules import ProbabilisticActor, TanhNormal
+from torchrl.modules import IndependentNormal, ProbabilisticActor, TanhNormal
 
 
 class BoundedNormalParams(nn.Module):
@@ -46,4 +46,49 @@ def make_gaussian_policy(
             "low": action_spec.space.low.to(device),
             "high": action_spec.space.high.to(device),
         },
+    )
+
+
+class FreeStd(nn.Module):
+    """Puts a mean in [-1, 1] into env units, beside a standard deviation that no state changes."""
+
+    def __init__(self, action_spec: Bounded, log_std_min: float, log_std_max: float) -> None:
+        """Begins with a standard deviation of half the action's range."""
+        super().__init__()
+        low, high = action_spec.space.low, action_spec.space.high
+        self.bounds = (log_std_min, log_std_max)
+        self.register_buffer("centre", (low + high) / 2)
+        self.register_buffer("half_range", (high - low) / 2)
+        self.log_std = nn.Parameter(torch.zeros_like(low))
+
+    def forward(self, mean: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns mean and standard deviation, (..., A) each, in env units."""
+        std = self.half_range * self.log_std.clamp(*self.bounds).exp()
+        return self.centre + self.half_range * mean, std.expand_as(mean)
+
+
+def make_clipped_policy(
+    network: nn.Module,
+    action_spec: Bounded,
+    log_std_min: float,
+    log_std_max: float,
+    device: torch.device,
+) -> ProbabilisticActor:
+    """Returns a Gaussian without a squash, whose actions are clipped to the environment's range.
+
+    Args:
+        network: Maps observations to a mean, (..., A), in which [-1, 1] is the action's range.
+        action_spec: The environment's.
+        log_std_min: Least logarithm of the standard deviation, in the same units.
+        log_std_max: The largest one.
+        device: Of the parameters.
+    """
+    spec = action_spec.to(device)
+    network = nn.Sequential(network, FreeStd(spec, log_std_min, log_std_max))
+    return ProbabilisticActor(
+        TensorDictModule(network, in_keys=["observation"], out_keys=["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        spec=spec,
+        safe=True,
+        distribution_class=IndependentNormal,
     )

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import hydra
 import torch
 from omegaconf.errors import OmegaConfBaseException
-from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase
 
 from agents import without_methods
@@ -20,6 +19,7 @@ from torchrl_aca.offline.layout import METADATA_FILE, sha256
 from torchrl_aca.offline.registry import ROOT
 from torchrl_aca.offline.scores import Scores
 from torchrl_aca.replay import TRANSITION_KEYS, MixedReplayBuffer, make_replay_buffer
+from torchrl_aca.training.agent import Agent
 from torchrl_aca.training.config import checked
 from torchrl_aca.training.envs import task_name
 
@@ -50,7 +50,7 @@ def dataset_path(cfg: Any) -> Path:
 
 def needs_data(cfg: Any) -> bool:
     """Whether there are minibatches with rows of the data set, in the online phase or before."""
-    return bool(cfg.offline_fraction or cfg.optim.offline_updates)
+    return bool(cfg.offline_fraction or (cfg.optim.offline_updates and cfg.pretrained is None))
 
 
 def generate_missing(cfg: Any) -> None:
@@ -119,6 +119,16 @@ def require_fit(cfg: Any, metadata: Mapping[str, Any], env: EnvBase) -> None:
         )
 
 
+def require_whole_episodes(cfg: Any, metadata: Mapping[str, Any]) -> None:
+    """Raises `RunError` if no episode of a data set has an end of its own."""
+    if len(metadata["incomplete_episodes"]) == metadata["episodes"]:
+        raise RunError(
+            f"dataset={cfg.dataset} has no episode with an end of its own, so what came after its "
+            f"rows is unknown; algo={cfg.algo.name} needs returns to go. Import the data with "
+            "their terminals and time limits, or take algo=cql."
+        )
+
+
 def task_scores(cfg: Any) -> Scores | None:
     """The returns that count as 0 and 100: the data set's, or else those known for the task.
 
@@ -131,16 +141,20 @@ def task_scores(cfg: Any) -> Scores | None:
     return reference_scores(cfg.env.name)
 
 
-def make_mixture(
-    cfg: Any, dataset: OfflineDataset | None, extra_keys: Sequence[NestedKey] = ()
-) -> MixedReplayBuffer:
-    """The buffer that minibatches are drawn from. The loss scales the rewards of both halves."""
+def make_mixture(cfg: Any, dataset: OfflineDataset | None, agent: Agent) -> MixedReplayBuffer:
+    """The buffer that minibatches are drawn from. The loss scales the rewards of both halves.
+
+    Raises:
+        RunError: If the agent needs whole episodes, and the recording has cut every one.
+    """
+    if dataset is not None and agent.offline_rows:
+        require_whole_episodes(cfg, dataset.metadata)
     return MixedReplayBuffer(
-        None if dataset is None else dataset.data,
+        None if dataset is None else agent.offline_rows_of(dataset.data),
         make_replay_buffer(cfg.buffer.capacity, cfg.optim.batch_size),
         offline_fraction=cfg.offline_fraction,
         batch_size=cfg.optim.batch_size,
-        keys=(*TRANSITION_KEYS, *extra_keys),
+        keys=(*TRANSITION_KEYS, *agent.extra_keys),
         seed=cfg.seed,
     )
 

@@ -16,8 +16,8 @@ from torchrl.data import Bounded, Composite, TensorSpec
 from torchrl.modules import ProbabilisticActor
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 
+from torchrl_aca.baselines.ensemble_td import EnsembleTDLoss
 from torchrl_aca.checks import check_above, check_choice
-from torchrl_aca.td_loss import TDLoss
 
 __all__ = ["EnsembleSACLoss"]
 
@@ -28,7 +28,7 @@ TEMPERATURES: dict[str, tuple[Callable[[Tensor], Tensor], Callable[[float], floa
 }
 
 
-class EnsembleSACLoss(TDLoss):
+class EnsembleSACLoss(EnsembleTDLoss):
     """Loss module of RLPD (*Efficient Online RL with Offline Data*, arXiv 2302.02948).
 
     With critics ``Q_1..Q_E``, their targets ``Q_bar_i``, a random subset ``M`` of the members for
@@ -126,11 +126,9 @@ class EnsembleSACLoss(TDLoss):
 
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
-    loss_names = ("loss_qvalue", "loss_actor", "loss_alpha")
-    metric_names = ("pred_value", "target_value", "entropy", "alpha")
+    loss_names: tuple[str, ...] = ("loss_qvalue", "loss_actor", "loss_alpha")
+    metric_names: tuple[str, ...] = ("pred_value", "target_value", "entropy", "alpha")
 
-    actor_network: ProbabilisticActor
-    qvalue_network: TensorDictModule
     target_entropy: Tensor
 
     def __init__(
@@ -149,27 +147,14 @@ class EnsembleSACLoss(TDLoss):
         reduction: Literal["none", "mean", "sum"] | None = None,
     ) -> None:
         super().__init__()
-        self.num_qvalue_nets = _stack_size(qvalue_network)
         check_choice(("mean", "min"), actor_value=actor_value)
         check_choice(tuple(TEMPERATURES), temperature=temperature)
-        if not 1 <= subset_size <= self.num_qvalue_nets:
-            raise ValueError(
-                f"subset_size must be from 1 to the number of critics ({self.num_qvalue_nets}), "
-                f"got {subset_size}."
-            )
         check_above(0, alpha_init=alpha_init)
-        self.actor_network = actor_network
-        self.convert_to_functional(qvalue_network, "qvalue_network", create_target_params=True)
-        self.subset_size = subset_size
-        self.subset_with_replacement = subset_with_replacement
+        self._set_networks(actor_network, qvalue_network, subset_size, subset_with_replacement)
         self.actor_value = actor_value
         self.entropy_backup = entropy_backup
         self.temperature = temperature
         self.reduction = reduction or "mean"
-        self._policy_action_key = actor_network.dist_sample_keys[0]
-        self.set_keys(
-            action=self._policy_action_key, state_action_value=qvalue_network.out_keys[-1]
-        )
         self._init_entropy(alpha_init, target_entropy, target_entropy_scale)
 
     def _init_entropy(self, alpha_init: float, target: float | str, scale: float) -> None:
@@ -199,11 +184,7 @@ class EnsembleSACLoss(TDLoss):
 
     def qvalue_loss(self, tensordict: TensorDictBase) -> TensorDict:
         """TD loss of all critics."""
-        target = self._target_value(tensordict)
-        action = tensordict[self.tensor_keys.action]
-        value = self._values(self.qvalue_network_params, tensordict, action)
-        error = (value - target).square().mean(-1)
-        metrics = {"pred_value": value.detach().mean(), "target_value": target.mean()}
+        error, metrics = self._td_error(tensordict, self._next_value(tensordict["next"]))
         return self._output("loss_qvalue", error, tensordict, metrics)
 
     def actor_loss(self, tensordict: TensorDictBase) -> TensorDict:
@@ -249,56 +230,32 @@ class EnsembleSACLoss(TDLoss):
         function, _ = TEMPERATURES[self.temperature]
         return function(self.raw_alpha)
 
-    def _sample(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Reparametrised actions ``(*batch, A)`` in env units, and log-probabilities ``(*batch,)``.
+    def _sample(
+        self, tensordict: TensorDictBase, num: tuple[int, ...] = ()
+    ) -> tuple[Tensor, Tensor]:
+        """Reparametrised actions ``(*num, *batch, A)`` in env units, and log-probabilities.
 
         The probability is of the very draw: recovering that from a rounded action would fail where
         tanh saturates.
         """
         actor = self.actor_network
         distribution = actor.get_dist(tensordict.select(*actor.in_keys))
-        action, log_prob = rsample_and_log_prob(distribution)
+        action, log_prob = rsample_and_log_prob(distribution, num)
         return action, log_prob + self._log_half_range
 
-    def _values(self, params: TensorDictBase, states: TensorDictBase, action: Tensor) -> Tensor:
-        """Critic values under ``params``, one per member in them: ``(*batch, members)``."""
-        keys = self.qvalue_network.in_keys
-        data = states.select(*keys, strict=False).set(self._policy_action_key, action)
-        with self._critics(params) as critics:
-            return critics(data)[self.tensor_keys.state_action_value]
-
-    def _subset(self) -> Tensor:
-        """Indices of the members in ``M``, drawn anew."""
-        num, device = self.num_qvalue_nets, self.raw_alpha.device
-        if self.subset_with_replacement:
-            return torch.randint(num, (self.subset_size,), device=device)
-        return torch.rand(num, device=device).topk(self.subset_size).indices
-
     @torch.no_grad()
-    def _target_value(self, tensordict: TensorDictBase) -> Tensor:
-        """TD target ``y`` of shape ``(*batch, 1)``, made by the value estimator."""
-        next_action, log_prob = self._sample(tensordict["next"])
-        members = self._subset()
-        # Only the members in M are evaluated: with two of ten, a fifth of the work.
-        params = self._target_params().data.apply(lambda stack: stack[members])
-        next_values = self._values(params, tensordict["next"], next_action)
-        next_value = next_values.amin(-1, keepdim=True)
-        if self.entropy_backup:
-            next_value = next_value - self.alpha * log_prob.unsqueeze(-1)
-        return self._td_target(tensordict, next_value)
+    def _next_value(self, states: TensorDictBase) -> Tensor:
+        """What the target bootstraps from, ``(*batch,)``: one action, a few members."""
+        action, log_prob = self._sample(states)
+        value = self._target_subset_value(states, action)
+        return value - self.alpha * log_prob if self.entropy_backup else value
 
-    def _state_keys(self) -> list[NestedKey]:
-        networks = [*self.actor_network.in_keys, *self.qvalue_network.in_keys]
-        return [key for key in dict.fromkeys(networks) if key != self._policy_action_key]
-
-
-def _stack_size(network: nn.Module) -> int:
-    """The number of members of a stack of networks."""
-    sizes = {param.shape[0] if param.ndim else 0 for param in network.parameters()}
-    if len(sizes) != 1 or 0 in sizes:
-        raise ValueError(
-            "qvalue_network must be a stack of critics, in which every parameter has one entry per "
-            f"critic along its first dimension; got first dimensions {sizes}. "
-            "torchrl_aca.baselines.EnsembleMLP is one."
-        )
-    return sizes.pop()
+    def _td_error(
+        self, tensordict: TensorDictBase, next_value: Tensor
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """``mean_i (Q_i(s, a) - y)^2``, ``(*batch,)``, and metrics."""
+        target = self._td_target(tensordict, next_value.unsqueeze(-1))
+        action = tensordict[self.tensor_keys.action]
+        value = self._values(self.qvalue_network_params, tensordict, action)
+        error = (value - target).square().mean(-1)
+        return error, {"pred_value": value.detach().mean(), "target_value": target.mean()}

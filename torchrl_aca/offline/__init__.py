@@ -1,6 +1,7 @@
 """Offline data: one form on disk, writing, checks, importers. Knows no algorithm."""
 
 from torchrl_aca.errors import DatasetError
+from torchrl_aca.offline.bounds import return_bounds
 from torchrl_aca.offline.dataset import OfflineDataset, returns_to_go
 from torchrl_aca.offline.from_d4rl import import_d4rl
 from torchrl_aca.offline.from_minari import import_minari
@@ -16,5 +17,6 @@ __all__ = [
     "import_minari",
     "reference_scores",
     "register_datasets",
+    "return_bounds",
     "returns_to_go",
 ]

@@ -6,12 +6,14 @@ from torchrl_aca.replay.buffer import (
     make_replay_buffer,
     transitions,
 )
+from torchrl_aca.replay.episodes import FinishedEpisodes
 from torchrl_aca.replay.mixture import MixedReplayBuffer
 from torchrl_aca.replay.multi_step import with_last_flags
 
 __all__ = [
     "TRANSITION_KEYS",
     "BufferState",
+    "FinishedEpisodes",
     "MixedReplayBuffer",
     "make_replay_buffer",
     "transitions",

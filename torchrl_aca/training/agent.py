@@ -10,6 +10,9 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 
+from torchrl_aca.replay import transitions
+
+Rows = Callable[[TensorDictBase], TensorDictBase]
 Update = Callable[[TensorDictBase], TensorDictBase]
 
 
@@ -38,6 +41,10 @@ class Agent:
         offline_update: As `update`, for the phase on the data set alone; None for a method that
             has no such phase.
         extra_keys: What a row of the replay buffer holds besides the transition.
+        rows: Takes collected data of shape (num_envs, steps) and returns the rows for the replay
+            buffer, (n,), where n may be 0; None: all transitions with their `extra_keys`.
+        offline_rows: Takes a data set of shape (n,), episode after episode, and returns it with
+            its `extra_keys`; None: it has them already.
     """
 
     policy: TensorDictModuleBase
@@ -45,3 +52,13 @@ class Agent:
     state: dict[str, Stateful]
     offline_update: Update | None = None
     extra_keys: tuple[NestedKey, ...] = ()
+    rows: Rows | None = None
+    offline_rows: Rows | None = None
+
+    def rows_of(self, data: TensorDictBase) -> TensorDictBase:
+        """Returns what of collected data goes to the replay buffer."""
+        return self.rows(data) if self.rows else transitions(data, self.extra_keys)
+
+    def offline_rows_of(self, data: TensorDictBase) -> TensorDictBase:
+        """Returns a data set with what the method needs in its rows."""
+        return self.offline_rows(data) if self.offline_rows else data

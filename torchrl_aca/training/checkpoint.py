@@ -60,12 +60,19 @@ def save_checkpoint(
     """
     directory.mkdir(parents=True, exist_ok=True)
     path = directory / f"checkpoint_{updates:010d}.pt"
-    states = {name: part.state_dict() for name, part in parts.items()}
-    content = {"format": FORMAT, "config": config, "parts": states}
-    replace_file(path, lambda file: torch.save(content, file))
+    write_content(path, parts, config)
     for old in list_checkpoints(directory)[:-keep_last]:
         old.unlink()
     return path
+
+
+def write_content(
+    path: Path, parts: Mapping[str, Stateful], config: dict[str, Any], **more: Any
+) -> None:
+    """Writes the states of parts, the configuration and `more` to a file, whole or not at all."""
+    states = {name: part.state_dict() for name, part in parts.items()}
+    content = {"format": FORMAT, "config": config, "parts": states, **more}
+    replace_file(path, lambda file: torch.save(content, file))
 
 
 def updates_of(path: Path) -> int:
@@ -97,7 +104,7 @@ def read_checkpoint(run_dir: Path, updates: int | None = None) -> dict[str, Any]
         )
     if updates is not None:
         checkpoints = _up_to(checkpoints, updates)
-    content, fault = _read(checkpoints[-1])
+    content, fault = read_content(checkpoints[-1])
     if fault:
         raise RunError(f"{checkpoints[-1]} {fault}. {_way_out(checkpoints)}")
     return content
@@ -117,13 +124,13 @@ def _up_to(checkpoints: list[Path], updates: int) -> list[Path]:
 def _way_out(checkpoints: list[Path]) -> str:
     """What to do about a newest checkpoint that cannot be used."""
     for before in reversed(checkpoints[:-1]):
-        if not _read(before)[1]:
+        if not read_content(before)[1]:
             return f"{before.name} is intact: delete the newer ones to go on from it."
     return "There is no intact one before it: start a new run."
 
 
-def _read(path: Path) -> tuple[dict[str, Any], str]:
-    """The content of a checkpoint, and what is wrong with it: nothing where it can be used."""
+def read_content(path: Path) -> tuple[dict[str, Any], str]:
+    """Returns a checkpoint's content, and what is wrong with it: nothing where it can be used."""
     try:
         with zipfile.ZipFile(path) as file:  # torch.save writes a checksum of every record
             if (record := file.testzip()) is not None:

@@ -120,6 +120,9 @@ def plot_curve(run_dir: Path, title: str, evaluations: Sequence[Mapping[str, Any
     low = [m - s for m, s in zip(mean, std, strict=True)]
     high = [m + s for m, s in zip(mean, std, strict=True)]
     axes.fill_between(updates, low, high, alpha=0.2)
+    if (offline := float(evaluations[-1].get("offline_updates") or 0)) > 0:
+        axes.axvline(offline, color="black", linestyle=":", label="end of the offline phase")
+        axes.legend()
     axes.set(title=title, xlabel=f"updates ({frames[-1]:.0f} frames at the end)", ylabel="return")
     axes.grid(alpha=0.3)
     figure.savefig(run_dir / "curve.png", dpi=120)

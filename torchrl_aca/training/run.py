@@ -24,6 +24,7 @@ from torchrl_aca.training.collection import BadDataError, Collection
 from torchrl_aca.training.config import RunConfig
 from torchrl_aca.training.files import write_text
 from torchrl_aca.training.logging import MetricMeans, ProgressBar, RunLogger
+from torchrl_aca.training.pretrained import save_pretrained
 from torchrl_aca.training.randomness import RandomState
 from torchrl_aca.training.report import plot_curve, versions, write_card
 from torchrl_aca.training.run_dir import lock, make_run_dir, require_newest
@@ -60,6 +61,7 @@ class Run:
         device: torch.device | str = "cpu",
         script: str = "",
         facts: Mapping[str, object] | None = None,
+        pretrained: int = 0,
     ) -> None:
         """Opens a new run directory, or the one in `cfg.resume`.
 
@@ -73,6 +75,7 @@ class Run:
             device: Where batches go.
             script: The recipe that can go on with the run.
             facts: More rows for the card.
+            pretrained: Offline updates that the agent of a new run has had in another one.
 
         Raises:
             RunError: If the checkpoint does not fit or needs no more updates; if a new run's
@@ -80,7 +83,8 @@ class Run:
                 since its checkpoint was read; or if the state of a part cannot be saved.
         """
         self.cfg, self.agent, self.collection = cfg, agent, collection
-        self.counters, self.means, self.completed = Counters(), MetricMeans(), False
+        self.counters = Counters(offline_updates=pretrained)
+        self.means, self.completed = MetricMeans(), False
         self.script, self.facts = script, facts or {}
         self._evaluate, self._device = evaluate, device
         self.parts: dict[str, Stateful] = {
@@ -197,9 +201,14 @@ class Run:
                 raise _Stopped
 
     def due(self, buffer: Any) -> Iterator[TensorDictBase]:
-        """Yields a batch for each update that the frames so far call for."""
+        """Yields a batch for each update that the frames so far call for.
+
+        They wait for the first row of experience, where a method keeps rows back.
+        """
         self._since = self.counters.updates
         due = updates_due(self.cfg, self.collection.frames)
+        if not len(getattr(buffer, "online", buffer)):
+            return
         while self.counters.updates < due:
             yield buffer.sample().to(self._device)
             self.counters.updates += 1
@@ -227,6 +236,8 @@ class Run:
             self.log_evaluation()
         if passed(cfg.checkpoint.interval, since, now) or now == last_offline:
             self.save()
+        if now == last_offline:
+            save_pretrained(self.dir, self.parts, self.config, self.facts)
         self.bar.advance(self.counters.total)
 
     # --- what it leaves ---------------------------------------------------------------------------
