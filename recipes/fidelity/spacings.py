@@ -38,16 +38,17 @@ SPACINGS: dict[str, Callable[[NoiseSchedule, Tensor], Tensor]] = {
     "log SNR": log_snr,
     "quadratic": power(2),
     "geometric": geometric,
+    "cubic": power(3),
     "quartic": power(4),
 }
-PACKAGE = "cubic"  # of torchrl_aca.chain.inference_levels
+PACKAGE = "low"  # torchrl_aca.chain.inference_levels
 
 
 def levels_of(spacing: str, schedule: NoiseSchedule, num_steps: int) -> list[int]:
     """Returns rising levels from 1 to T: rounded, and moved apart where two would coincide."""
     num_levels = schedule.num_steps
     if spacing == PACKAGE or num_steps == num_levels:
-        return inference_levels(num_levels, num_steps)
+        return inference_levels(schedule, num_steps)
     grid = torch.linspace(0, 1, num_steps, dtype=torch.float64)
     levels = SPACINGS[spacing](schedule, grid).round().long().tolist()
     for k in range(1, num_steps):
