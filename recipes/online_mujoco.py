@@ -49,7 +49,7 @@ def train(cfg: DictConfig, checkpoint: dict[str, Any] | None = None) -> Path:
         cfg, agent, buffer, collection, evaluation, checkpoint, device=device, script=__file__
     ) as run:
         for data in collection:  # of shape (num_envs, steps)
-            buffer.extend(transitions(data, agent.extra_keys))
+            buffer.extend(transitions(data, agent.extra_keys, agent.rewrites))
             for batch in run.due(buffer):
                 run.add(agent.update(batch))
             if run.end_iteration():

@@ -4,7 +4,9 @@ from torchrl_aca.replay.buffer import (
     TRANSITION_KEYS,
     BufferState,
     make_replay_buffer,
+    require_index,
     transitions,
+    write_back,
 )
 from torchrl_aca.replay.mixture import MixedReplayBuffer
 from torchrl_aca.replay.multi_step import with_last_flags
@@ -14,6 +16,8 @@ __all__ = [
     "BufferState",
     "MixedReplayBuffer",
     "make_replay_buffer",
+    "require_index",
     "transitions",
     "with_last_flags",
+    "write_back",
 ]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from tensordict import TensorDictBase
@@ -32,12 +32,14 @@ class Agent:
             `ExplorationType.RANDOM`, the evaluation under `ExplorationType.DETERMINISTIC`.
         update: Takes a batch of transitions of shape (B,), makes one update and returns detached
             scalar metrics. A metric that is not there in every update is averaged over the
-            updates that report it.
+            updates that report it. It leaves the batch as it is, but for what it `rewrites`.
         state: Everything that the next update depends on, by name: the loss with its targets,
             optimisers, schedulers, counters. It is what a checkpoint saves and restores.
         offline_update: As `update`, for the phase on the data set alone; None for a method that
             has no such phase.
         extra_keys: What a row of the replay buffer holds besides the transition.
+        rewrites: Entries of a row that `update` changes in its batch, and the loop then in the
+            buffer; each with the entry of the transition that it begins as.
     """
 
     policy: TensorDictModuleBase
@@ -45,3 +47,4 @@ class Agent:
     state: dict[str, Stateful]
     offline_update: Update | None = None
     extra_keys: tuple[NestedKey, ...] = ()
+    rewrites: Mapping[NestedKey, NestedKey] = field(default_factory=dict)
