@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 import torch
 
 from torchrl_aca.baselines.dacer import distributional_error, running_scale

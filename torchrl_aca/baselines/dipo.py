@@ -13,6 +13,8 @@ from torchrl_aca.checks import check_above, check_at_least
 
 __all__ = ["improve_actions"]
 
+_EAGER = StepRunner(compiled=False)
+
 
 def improve_actions(
     gradient: Callable[[Tensor], Tensor],
@@ -21,7 +23,7 @@ def improve_actions(
     num_steps: int = 30,
     lr: float = 0.03,
     max_norm: float = 0.16,
-    run: Callable[..., Any] = StepRunner(compiled=False),
+    run: Callable[..., Any] = _EAGER,
 ) -> Tensor:
     """DIPO's action gradient: steps of a fresh Adam up the critics' value, inside [-1, 1].
 
