@@ -52,6 +52,7 @@ def denoise(
     noise: Tensor,
     *,
     clip: bool | float = True,
+    clip_step: bool | float = False,
     variance: Variance = "posterior",
     initial_scale: float = 1.0,
     predict_last: bool = True,
@@ -73,6 +74,8 @@ def denoise(
 
     Keyword Args:
         clip: see :func:`posterior_step`. Default: True.
+        clip_step: clip the action after each step to [-1, 1], or to [-c, c] for a number ``c``.
+            Default: False.
         variance: see :func:`posterior_step`. Default: ``"posterior"``.
         initial_scale: the chain starts from so many times ``noise[0]``. Default: 1.
         predict_last: ask for the noise in the step from level 1 as well. Where it is zero there, as
@@ -85,7 +88,7 @@ def denoise(
     Returns:
         ``a_0`` of shape ``(*batch, A)``.
     """
-    constants = schedule, clip, variance
+    constants = schedule, clip, clip_step, variance
     *rows, last = torch.arange(schedule.num_steps, 0, -1, device=noise.device)
     steps = [partial(run, _denoise_step, predict_noise, *constants, row) for row in rows]
     if predict_last:
@@ -200,6 +203,7 @@ def _denoise_step(
     predict_noise: Callable[[Tensor, Tensor], Tensor],
     schedule: NoiseSchedule,
     clip: bool | float,
+    clip_step: bool | float,
     variance: Variance,
     row: Tensor,
     action: Tensor,
@@ -208,7 +212,8 @@ def _denoise_step(
     """One step; which is a tensor, so that one compiled step serves them all."""
     level = schedule.noise_levels.index_select(0, row.reshape(-1) - 1).reshape(row.shape)
     predicted_noise = predict_noise(action, level)
-    return posterior_step(schedule, action, predicted_noise, noise, row, clip, variance)
+    action = posterior_step(schedule, action, predicted_noise, noise, row, clip, variance)
+    return _clipped(action, clip_step)
 
 
 def _no_noise(action: Tensor, level: Tensor) -> Tensor:

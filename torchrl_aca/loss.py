@@ -263,10 +263,6 @@ class ACALoss(TDLoss):
         value = self.qvalue_network.evaluate(features, rows, level.reshape(-1))
         return value.reshape(*action.shape[:-1], value.shape[-1])
 
-    def _given(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor | None:
-        """Draws that the input holds, if any and if wanted."""
-        return tensordict.get(key, None) if self.use_given_draws else None
-
     @torch.no_grad()
     def sample_next_action(self, tensordict: TensorDictBase) -> Tensor:
         """Draws ``a'_0`` of the target, in env units, shape ``(*batch, A)``.
@@ -309,12 +305,6 @@ class ACALoss(TDLoss):
 
     def _state_keys(self) -> list[NestedKey]:
         return self.actor_network.in_keys
-
-    def _maybe_get_priority_weight(self, tensordict: TensorDictBase) -> Tensor | None:
-        """As the parent's, whose test for the key fails on nested keys."""
-        if self.use_prioritized_weights not in (True, "auto"):
-            return None
-        return tensordict.get(self.tensor_keys.priority_weight, None)
 
     def _tie(self) -> None:
         """The actor holds the loss's parameters and buffers."""

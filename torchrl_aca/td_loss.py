@@ -34,6 +34,7 @@ class TDLoss(LossModule):
 
     tensor_keys: Any
     reduction: str
+    use_given_draws: bool = True
     loss_names: tuple[str, ...]
     metric_names: tuple[str, ...]
     default_value_estimator = ValueEstimators.TD0
@@ -103,6 +104,16 @@ class TDLoss(LossModule):
         if self.reduction == "none":
             return TensorDict({name: loss}, batch_size=tensordict.batch_size)
         return TensorDict({name: loss, **metrics})
+
+    def _given(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor | None:
+        """Draws that the input holds, if any and if wanted."""
+        return tensordict.get(key, None) if self.use_given_draws else None
+
+    def _maybe_get_priority_weight(self, tensordict: TensorDictBase) -> Tensor | None:
+        """Importance weights, if any; the parent's test for the key fails on nested keys."""
+        if self.use_prioritized_weights not in (True, "auto"):
+            return None
+        return tensordict.get(self.tensor_keys.priority_weight, None)
 
     def make_value_estimator(
         self, value_type: ValueEstimators | None = None, **hyperparams: Any

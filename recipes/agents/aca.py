@@ -11,6 +11,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.objectives import SoftUpdate
 
+from agents.learning_rate import DecayOptim, linear_decay
 from torchrl_aca import ACALoss, CriticGuidedDenoisingActor, NoiseLevelCritic, NoiseSchedule
 from torchrl_aca.training.acceleration import capture, compiled, descend, make_adam
 from torchrl_aca.training.agent import Agent
@@ -18,7 +19,6 @@ from torchrl_aca.training.checkpoint import Counters
 from torchrl_aca.training.config import (
     Count,
     NonNegative,
-    Optim,
     Positive,
     Section,
     Widths,
@@ -59,21 +59,11 @@ class ACASettings(Section):
         return self
 
 
-class ACAOptim(Optim):
+class ACAOptim(DecayOptim):
     """The section `optim` of ACA."""
 
-    lr: Positive
     lr_end: NonNegative
-    lr_decay_start: NonNegative
-    lr_decay_end: NonNegative
     alpha_lr: Positive
-
-    @model_validator(mode="after")
-    def _decay(self) -> ACAOptim:
-        if self.lr_decay_end < self.lr_decay_start:
-            expected = f"at least optim.lr_decay_start ({self.lr_decay_start})"
-            self.refuse("lr_decay_end", expected)
-        return self
 
 
 def make_aca_loss(cfg: Any, env: EnvBase, device: torch.device) -> ACALoss:
@@ -124,7 +114,7 @@ def make_aca(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
     optimizer = make_adam(loss.qvalue_network.parameters(), optim.lr, cfg.cudagraphs)
     alpha_optimizer = make_adam([loss.log_alpha], optim.alpha_lr, cfg.cudagraphs)
     # The decay counts steps of the optimiser, of which an update takes one or two.
-    scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, partial(lr_factor, optim))
+    scheduler = linear_decay(optimizer, optim, optim.lr, optim.lr_end)
     progress = Counters()
     # The chain compiles its own step, so it is drawn before the compiled loss.
     qvalue_loss = compiled(loss.qvalue_loss, cfg.compile)
@@ -171,10 +161,3 @@ def make_aca(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
             "progress": progress,
         },
     )
-
-
-def lr_factor(optim: ACAOptim, step: int) -> float:
-    """Returns the factor of `lr` after so many optimiser steps: linear decay to `lr_end`."""
-    span = max(optim.lr_decay_end - optim.lr_decay_start, 1)
-    progress = min(max((step - optim.lr_decay_start) / span, 0.0), 1.0)
-    return 1 + progress * (optim.lr_end / optim.lr - 1)

@@ -1,0 +1,305 @@
+"""A policy that is a reverse chain driven by a network, with best-of-N by critics."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torchrl.data import Composite, TensorSpec
+from torchrl.envs.utils import ExplorationType, exploration_type
+
+from torchrl_aca import chain
+from torchrl_aca import functional as F
+from torchrl_aca.checks import (
+    action_spec,
+    check_above,
+    check_at_least,
+    check_choice,
+    first_parameter,
+)
+from torchrl_aca.schedule import NoiseSchedule
+
+__all__ = ["DiffusionPolicy"]
+
+
+class DiffusionPolicy(TensorDictModuleBase):
+    """Samples actions by a reverse chain whose noise, or score, a network predicts.
+
+    For each state, ``num_candidates`` chains run from ``a_T ~ N(0, initial_scale^2 I)``; the
+    candidate with the largest minimum over the critics is kept, and Gaussian exploration noise of
+    standard deviation ``exploration_noise * alpha`` is added.
+
+    With a :class:`~torchrl_aca.NoiseSchedule` the chain is DDPM's and the network predicts the
+    noise. With a sequence of step sizes it is annealed Langevin sampling, and the network predicts
+    the score.
+
+    Under the exploration types RANDOM and None the draws are fresh and the exploration noise is
+    added. Under DETERMINISTIC, MODE, MEAN and MEDIAN only the exploration noise is dropped: the
+    chains start from one fixed set of draws, the same for every state, or from fresh ones with
+    ``deterministic_draws="fresh"``. Best of N stays.
+
+    Data holds actions in the env's units; network and critics see [-1, 1]. :meth:`to_env` and
+    :meth:`from_env` map between the two by the bounds of ``spec``.
+
+    Args:
+        network: a :class:`NoiseNetwork`, or whatever else has its ``encode`` and ``forward``.
+        schedule: the diffusion's constants, or the step sizes of Langevin sampling, first to last.
+
+    Keyword Args:
+        critic: a :class:`TwinCritic`, or whatever else has its ``encode`` and ``evaluate``; needed
+            for more than one candidate.
+        spec: bounded action spec of one env (``env.action_spec_unbatched``), or a ``Composite``
+            that holds it under the action's key. Default: actions are in [-1, 1].
+        action_dim: size ``A`` of the action; needed without ``spec`` for a network that tells none.
+        num_candidates: ``N``. Default: 1.
+        initial_scale: standard deviation of the chain's start. Default: 1.
+        clip_denoised: clip the clean estimate of each step; see
+            :func:`~torchrl_aca.chain.posterior_step`. Default: True.
+        clip_step: clip the action after each step; Langevin sampling always does. Default: False.
+        variance: of DDPM's steps, ``"posterior"`` or ``"beta"``. Default: ``"posterior"``.
+        exploration_noise: standard deviation of the exploration noise at ``alpha = 1``, in
+            [-1, 1] units. Default: 0.
+        alpha_init: initial ``alpha``. Default: 1.
+        clip_action: clip the action, with its exploration noise, to the bounds. Default: False.
+        deterministic_draws: the chain's draws without exploration: one ``"fixed"`` set, or
+            ``"fresh"`` ones. Default: ``"fixed"``.
+        compile_step: run the chain's step and the choice among the candidates through
+            ``torch.compile``. Default: False.
+        tile_rows: rows (states times candidates) that a CPU takes through the chain at once, at
+            least one candidate of every state. It changes cost, not the result. Default: 1024.
+        in_keys: the observation's key.
+        out_keys: the action's key.
+
+    Raises:
+        ValueError: if a number is out of range, the spec is not a bounded vector, there are
+            candidates but no critics, or network and schedule differ in their steps.
+
+    Examples:
+        >>> from torchrl_aca.baselines import DiffusionPolicy, NoiseNetwork, TwinCritic
+        >>> network, critic = NoiseNetwork(17, 6), TwinCritic(17, 6)
+        >>> policy = DiffusionPolicy(
+        ...     network, NoiseSchedule.vp(20), critic=critic, num_candidates=4
+        ... )
+        >>> policy(TensorDict(observation=torch.zeros(3, 17), batch_size=[3]))["action"].shape
+        torch.Size([3, 6])
+    """
+
+    center: Tensor
+    half_range: Tensor
+    fixed_noise: Tensor
+    network: Any
+    critic: Any
+    schedule: Any
+
+    def __init__(
+        self,
+        network: nn.Module,
+        schedule: NoiseSchedule | Sequence[float],
+        *,
+        critic: nn.Module | None = None,
+        spec: TensorSpec | None = None,
+        action_dim: int | None = None,
+        num_candidates: int = 1,
+        initial_scale: float = 1.0,
+        clip_denoised: bool | float = True,
+        clip_step: bool | float = False,
+        variance: Literal["posterior", "beta"] = "posterior",
+        exploration_noise: float = 0.0,
+        alpha_init: float = 1.0,
+        clip_action: bool = False,
+        deterministic_draws: Literal["fixed", "fresh"] = "fixed",
+        compile_step: bool = False,
+        tile_rows: int = 1024,
+        in_keys: Sequence[NestedKey] = ("observation",),
+        out_keys: Sequence[NestedKey] = ("action",),
+    ) -> None:
+        super().__init__()
+        check_at_least(1, num_candidates=num_candidates, tile_rows=tile_rows)
+        check_at_least(0, exploration_noise=exploration_noise, clip_denoised=clip_denoised)
+        check_at_least(0, clip_step=clip_step)
+        check_above(0, alpha_init=alpha_init, initial_scale=initial_scale)
+        check_choice(("posterior", "beta"), variance=variance)
+        check_choice(("fixed", "fresh"), deterministic_draws=deterministic_draws)
+        anchor = first_parameter(network)
+        self.network, self.critic = network, critic
+        self.schedule, self.step_sizes = None, None
+        if isinstance(schedule, NoiseSchedule):
+            # A copy: `to` works in place, and the schedule may serve policies elsewhere too.
+            self.schedule = copy.deepcopy(schedule).to(anchor.device)
+            self.num_steps = schedule.num_steps
+        else:
+            self.step_sizes = [float(size) for size in schedule]
+            self.num_steps = len(self.step_sizes)
+            check_above(0, least_step_size=min(self.step_sizes, default=0.0))
+        _check_fit(network, critic, self.num_steps, num_candidates)
+        self.num_candidates = num_candidates
+        self.initial_scale = initial_scale
+        self.clip_denoised, self.clip_step = clip_denoised, clip_step
+        self.variance = variance
+        self.exploration_noise = exploration_noise
+        self.clip_action = clip_action
+        self.deterministic_draws = deterministic_draws
+        self._run = chain.StepRunner(compile_step)
+        self.tile_rows = tile_rows
+        self.in_keys, self.out_keys = list(in_keys), list(out_keys)
+        self.log_alpha = nn.Parameter(anchor.new_tensor(math.log(alpha_init)))
+        action_dim = action_dim or getattr(network, "action_dim", None)
+        leaf = action_spec(spec, self.out_keys[0], action_dim)
+        self.spec = Composite({self.out_keys[0]: leaf}).to(anchor.device)
+        self.action_dim = leaf.shape[-1]
+        low, high = torch.full(leaf.shape, -1.0), torch.full(leaf.shape, 1.0)
+        if spec is not None:
+            low, high = leaf.space.low, leaf.space.high
+        shape = (self.num_steps + 1, num_candidates, self.action_dim)
+        constants = {
+            "center": (high + low) / 2,
+            "half_range": (high - low) / 2,
+            "fixed_noise": torch.randn(shape, generator=torch.Generator().manual_seed(0)),
+        }
+        for name, value in constants.items():
+            self.register_buffer(name, value.to(anchor), persistent=False)
+
+    def on(self, network: nn.Module) -> DiffusionPolicy:
+        """The same policy with another network: critics and ``alpha`` stay shared."""
+        other = copy.copy(self)
+        other._modules = {**self._modules, "network": network}
+        return other
+
+    # --- units ------------------------------------------------------------------------------------
+
+    def to_env(self, action: Tensor) -> Tensor:
+        """[-1, 1] to the env's units."""
+        return self.center + self.half_range * action
+
+    def from_env(self, action: Tensor) -> Tensor:
+        """The env's units to [-1, 1]."""
+        return (action.to(self.center.dtype) - self.center) / self.half_range
+
+    # --- the candidates ---------------------------------------------------------------------------
+
+    def denoise(self, observation: Tensor, noise: Tensor) -> Tensor:
+        """Run all chains on given draws; differentiable, unless under ``no_grad``.
+
+        Args:
+            observation: observations of shape ``(B, O)``.
+            noise: standard normal draws of shape ``(T + 1, N, B, A)``: row 0 is the chain's start,
+                row ``k`` belongs to the ``k``-th step.
+
+        Returns:
+            All candidates in [-1, 1] units, shape ``(N, B, A)``.
+        """
+        features = self.network.encode(observation)
+        how: dict[str, Any] = {
+            "initial_scale": self.initial_scale,
+            "tile_rows": self.tile_rows,
+            "run": self._run,
+        }
+        if self.step_sizes is not None:
+            score = partial(self._score, features)
+            return chain.langevin(score, noise, self.step_sizes, clip=True, **how)
+        how.update(clip=self.clip_denoised, clip_step=self.clip_step, variance=self.variance)
+        return chain.denoise(partial(self._noise, features), self.schedule, noise, **how)
+
+    def _noise(self, features: Any, action: Tensor, level: Tensor) -> Tensor:
+        return self.network(features, action, level)
+
+    def _score(self, features: Any, action: Tensor) -> Tensor:
+        clean = torch.ones((), dtype=torch.long, device=action.device)
+        return self.network(features, action, clean)
+
+    @torch.no_grad()
+    def values(self, observation: Tensor, candidates: Tensor) -> Tensor:
+        """Critic values of candidates ``(N, B, A)`` in [-1, 1] units, shape ``(N, B, E)``."""
+        features = self.critic.encode(observation)
+        tiles = chain.tiles(candidates, self.tile_rows, dim=0)
+        return torch.cat([self._run(self._values, features, tile) for tile in tiles])
+
+    def _values(self, features: Any, candidates: Tensor) -> Tensor:
+        return self.critic.evaluate(features, candidates)
+
+    def explore(self, action: Tensor, draw: Tensor) -> Tensor:
+        """The action with exploration noise, and clipped if ``clip_action``, in [-1, 1] units.
+
+        Args:
+            action: actions of shape ``(*batch, A)``.
+            draw: standard normal draws of the same shape.
+        """
+        action = action + self.exploration_noise * self.log_alpha.exp() * draw
+        return action.clamp(-1, 1) if self.clip_action else action
+
+    # --- acting -----------------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def sample(
+        self,
+        observation: Tensor,
+        *,
+        num_candidates: int | None = None,
+        deterministic: bool = False,
+    ) -> Tensor:
+        """Actions in env units, shape ``(*batch, A)``.
+
+        Args:
+            observation: observations of shape ``(*batch, O)``.
+            num_candidates: ``N`` of this call. Default: the policy's.
+            deterministic: no exploration noise, and draws as ``deterministic_draws`` says.
+        """
+        batch = observation.shape[:-1]
+        rows = observation.reshape(-1, observation.shape[-1])
+        draws = self.draws(len(rows), num_candidates, deterministic)
+        candidates = self.denoise(rows, draws[:-1])
+        action = candidates[0]
+        if len(candidates) > 1:
+            action = F.select_best(candidates, self.values(rows, candidates))
+        action = self.explore(action, draws[-1, 0])
+        return self.to_env(action).reshape(*batch, self.action_dim)
+
+    def draws(
+        self, num_rows: int, num_candidates: int | None = None, deterministic: bool = False
+    ) -> Tensor:
+        """All draws of a call, ``(T + 2, N, rows, A)``: those of the chain, then of exploration.
+
+        Raises:
+            ValueError: if ``num_candidates`` is below 1, or exceeds that of the fixed draws.
+        """
+        num_chains = self.num_candidates if num_candidates is None else num_candidates
+        check_at_least(1, num_candidates=num_chains)
+        if not deterministic or self.deterministic_draws == "fresh":
+            shape = (self.num_steps + 2, num_chains, num_rows, self.action_dim)
+            draws = torch.randn(shape, dtype=self.center.dtype, device=self.center.device)
+            if deterministic:
+                draws[-1] = 0.0
+            return draws
+        if num_chains > self.fixed_noise.shape[1]:
+            raise ValueError(
+                f"A deterministic call has draws for {self.fixed_noise.shape[1]} candidates, got "
+                f"num_candidates={num_chains}. Build the policy with that many."
+            )
+        draws = self.fixed_noise[:, :num_chains, None].expand(-1, -1, num_rows, -1)
+        return torch.cat([draws, torch.zeros_like(draws[:1])])
+
+    @dispatch(auto_batch_size=False)
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action for observations of any batch shape, ``()`` included."""
+        deterministic = exploration_type() not in (None, ExplorationType.RANDOM)
+        action = self.sample(tensordict[self.in_keys[0]], deterministic=deterministic)
+        return tensordict.set(self.out_keys[0], action)
+
+
+def _check_fit(network: Any, critic: nn.Module | None, num_steps: int, num: int) -> None:
+    """A ValueError unless the parts belong together."""
+    if getattr(network, "num_steps", num_steps) != num_steps:
+        raise ValueError(
+            f"The network has num_steps={network.num_steps} noise levels, the chain {num_steps} "
+            "steps. Build both with the same number."
+        )
+    if num > 1 and critic is None:
+        raise ValueError(f"num_candidates={num} needs critics to choose by: pass critic=... .")
