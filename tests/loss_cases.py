@@ -14,7 +14,15 @@ from torchrl.modules import MLP, NormalParamExtractor, ProbabilisticActor, TanhN
 from torchrl.objectives import SoftUpdate
 
 from torchrl_aca import ACALoss, CriticGuidedDenoisingActor, NoiseLevelCritic, NoiseSchedule
-from torchrl_aca.baselines import EnsembleMLP, EnsembleSACLoss
+from torchrl_aca.baselines import (
+    DACERLoss,
+    DiffusionPolicy,
+    DIPOLoss,
+    EnsembleMLP,
+    EnsembleSACLoss,
+    NoiseNetwork,
+    TwinCritic,
+)
 
 OBSERVATION_DIM, ACTION_DIM, NUM_STEPS = 3, 2, 4
 LOW, HIGH = torch.tensor([-2.0, -1.0]).double(), torch.tensor([1.0, 3.0]).double()
@@ -143,6 +151,54 @@ def make_rlpd_data(*batch):
     )
 
 
+# --- diffusion policies ---------------------------------------------------------------------------
+
+
+def make_diffusion_policy(
+    state="observation", action="action", critic=None, num_outputs=1, spec=True, **kwargs
+):
+    """A small policy in float64 with its critics."""
+    sizes = OBSERVATION_DIM, ACTION_DIM
+    mlp = {"num_cells": (6, 5), "dtype": torch.float64}
+    network = NoiseNetwork(*sizes, num_steps=NUM_STEPS, embedding_dim=4, **mlp)
+    return DiffusionPolicy(
+        network,
+        NoiseSchedule.cosine(NUM_STEPS),
+        critic=critic or TwinCritic(*sizes, num_outputs=num_outputs, **mlp),
+        spec=Bounded(LOW, HIGH, (ACTION_DIM,), dtype=torch.float64) if spec else None,
+        in_keys=[state],
+        out_keys=[action],
+        **kwargs,
+    )
+
+
+def with_targets_apart(loss):
+    """A loss whose targets differ from what they follow, with the discount of the tests."""
+    loss.make_value_estimator(gamma=0.875)
+    SoftUpdate(loss, tau=0.1)
+    for name, param in loss.named_parameters():
+        if "network" in name:
+            param.data.add_(0.1 * torch.randn_like(param))
+    return loss
+
+
+def make_dipo(state="observation", action="action", critic=None, **kwargs):
+    policy = make_diffusion_policy(state, action, critic)
+    return with_targets_apart(DIPOLoss(policy, num_gradient_steps=4, **kwargs))
+
+
+def make_dipo_data(*batch):
+    data = make_rlpd_data(*batch)
+    unit = torch.rand_like(data["action"])
+    return data.set("best_action", LOW + unit * (HIGH - LOW))
+
+
+def make_dacer(state="observation", action="action", critic=None, **kwargs):
+    noise = {"exploration_noise": 0.1, "alpha_init": 3.0, "clip_action": True}
+    policy = make_diffusion_policy(state, action, critic, num_outputs=2, **noise)
+    return with_targets_apart(DACERLoss(policy, num_entropy_samples=30, **kwargs))
+
+
 # --- all losses -----------------------------------------------------------------------------------
 
 
@@ -179,6 +235,22 @@ CASES = {
         frozenset(
             {"pred_value", "target_value", "noisy_value", "alpha", "entropy", "exploration_std"}
         ),
+        frozenset({"td_error"}),
+    ),
+    "dacer": LossCase(
+        make_dacer,
+        make_rlpd_data,
+        ("qvalue_loss", "actor_loss", "alpha_loss"),
+        frozenset(
+            {"pred_value", "target_value", "value_std", "alpha", "entropy", "exploration_std"}
+        ),
+        frozenset({"td_error"}),
+    ),
+    "dipo": LossCase(
+        make_dipo,
+        make_dipo_data,
+        ("qvalue_loss", "actor_loss"),
+        frozenset({"pred_value", "target_value", "improvement"}),
         frozenset({"td_error"}),
     ),
     "rlpd": LossCase(

@@ -15,7 +15,7 @@ from torchrl.objectives import HardUpdate, SoftUpdate
 
 from loss_cases import ACTION_DIM, CASES, OBSERVATION_DIM, make_actor, make_policy
 from torchrl_aca import ACALoss
-from torchrl_aca.baselines import EnsembleMLP, EnsembleSACLoss
+from torchrl_aca.baselines import DiffusionPolicyLoss, EnsembleMLP, EnsembleSACLoss, TwinCritic
 
 NEXT_KEYS = ("reward", "done", "terminated")
 COPIES = {"deepcopy": copy.deepcopy, "pickle": lambda loss: pickle.loads(pickle.dumps(loss))}
@@ -53,6 +53,15 @@ def assert_tied(loss):
         actor = loss.actor_network
         assert actor.critic is network and actor.log_alpha is loss.log_alpha
         assert actor.guidance_weight is loss.guidance_weight
+    if isinstance(loss, DiffusionPolicyLoss):
+        actor, params = loss.actor_network, loss.policy_network_params
+        assert actor.critic is network and actor.network is loss.policy_network
+        assert {id(p) for p in actor.network.parameters()} == {id(p) for p in params.parameters()}
+        assert actor.log_alpha is getattr(loss, "log_alpha", actor.log_alpha)
+        if loss.average_policy:
+            average = {p.data_ptr() for p in loss.average_actor_network.network.parameters()}
+            targets = loss.target_policy_network_params.values(True, True)
+            assert average == {p.data_ptr() for p in targets}
 
 
 # --- what it reads and writes ---------------------------------------------------------------------
@@ -180,9 +189,9 @@ def test_keyword_arguments_give_what_a_tensordict_gives(case, reduction):
 def test_select_out_keys_leaves_the_chosen_ones(case):
     loss, data = case.make(), case.data(6)
     expected = seeded(loss, data.select(*loss.in_keys))
-    loss.select_out_keys("loss_qvalue", "alpha")
-    value, alpha = seeded(lambda: loss(**as_kwargs(loss, data)))
-    assert (value, alpha) == (expected["loss_qvalue"], expected["alpha"])
+    loss.select_out_keys("loss_qvalue", "pred_value")
+    chosen = seeded(lambda: loss(**as_kwargs(loss, data)))
+    assert chosen == (expected["loss_qvalue"], expected["pred_value"])
 
 
 IN_KEYS = [(name, key) for name in CASES for key in CASES[name].make().in_keys]
@@ -314,9 +323,28 @@ class ShiftedEnsemble(EnsembleMLP):
         return super().forward(*inputs) + self.shift
 
 
+class ShiftedTwins(TwinCritic):
+    """Critics of a diffusion policy whose values, of DACER the means, are shifted by a buffer."""
+
+    def __init__(self, num_outputs):
+        sizes = {"num_outputs": num_outputs, "num_cells": (6,), "dtype": torch.float64}
+        super().__init__(OBSERVATION_DIM, ACTION_DIM, **sizes)
+        self.register_buffer("shift", torch.zeros(2, dtype=torch.float64))
+
+    def evaluate(self, features, action):
+        values = super().evaluate(features, action)
+        if self.num_outputs == 1:
+            return values + self.shift
+        return values + self.shift[:, None] * values.new_tensor([1.0, 0.0])
+
+
 def make_shifted(name):
     if name == "aca":
         return ACALoss(make_actor(ShiftedCritic(), action_dim=ACTION_DIM))
+    if name != "rlpd":
+        loss = CASES[name].make(critic=ShiftedTwins(num_outputs=2 if name == "dacer" else 1))
+        loss.make_value_estimator(gamma=0.99)
+        return loss
     critics = ValueOperator(ShiftedEnsemble(), in_keys=["observation", "action"])
     return EnsembleSACLoss(make_policy(), critics)
 
@@ -379,7 +407,8 @@ def test_batch_norm_of_a_critic_counts_online_rows_and_serves_the_targets():
 
 
 @pytest.mark.parametrize(
-    ("name", "given"), [("aca", ()), ("aca", ("noise", "noise_level", "next_action")), ("rlpd", ())]
+    ("name", "given"),
+    [*((name, ()) for name in CASES), ("aca", ("noise", "noise_level", "next_action"))],
 )
 def test_compiled_losses_equal_eager_ones(name, given):
     case = CASES[name]

@@ -232,7 +232,8 @@ class DiffusionPolicy(TensorDictModuleBase):
             action: actions of shape ``(*batch, A)``.
             draw: standard normal draws of the same shape.
         """
-        action = action + self.exploration_noise * self.log_alpha.exp() * draw
+        # Detached: where a loss differentiates the action, it is not by alpha.
+        action = action + self.exploration_noise * self.log_alpha.detach().exp() * draw
         return action.clamp(-1, 1) if self.clip_action else action
 
     # --- acting -----------------------------------------------------------------------------------
