@@ -152,6 +152,11 @@ class TDLoss(LossModule):
         clone._tie()
         return clone
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """As a copy; pickle gives shared memory back as memory of its own."""
+        super().__setstate__(state)
+        self._tie()
+
     def _apply(self, fn: Callable) -> Any:
         """Casts and moves make new buffers, in the loss and in its parts: tie them again."""
         super()._apply(fn)

@@ -80,7 +80,7 @@ class DiffusionPolicyLoss(TDLoss):
 
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
-    loss_names = ("loss_qvalue", "loss_actor")
+    loss_names: tuple[str, ...] = ("loss_qvalue", "loss_actor")
     metric_names: tuple[str, ...] = ("pred_value", "target_value")
 
     actor_network: DiffusionPolicy

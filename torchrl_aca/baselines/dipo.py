@@ -24,8 +24,7 @@ _EAGER = StepRunner(compiled=False)
 
 
 class DIPOLoss(DiffusionPolicyLoss):
-    """Loss module of DIPO (*Policy Representation via Diffusion Probability Model for
-    Reinforcement Learning*, arXiv 2305.13122).
+    """Loss module of DIPO (*Policy Representation via Diffusion ...*, arXiv 2305.13122).
 
     Each row of the replay buffer holds its best action so far, ``b``, which begins as the action
     taken. Two losses, each to be had alone:
