@@ -14,8 +14,11 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from agents.aca import ACAOptim, ACASettings, make_aca
-from agents.rlpd import RLPDOptim, RLPDSettings, Variant, make_rlpd
+from agents.dacer import DACEROptim, DACERSettings, make_dacer
+from agents.dipo import DIPOOptim, DIPOSettings, make_dipo
+from agents.rlpd import RLPDOptim, RLPDSettings, make_rlpd
 from agents.sac import SACOptim, SACSettings, make_sac
+from agents.variant import Variant
 from torchrl_aca.errors import RunError
 from torchrl_aca.training.agent import Agent
 from torchrl_aca.training.checkpoint import read_checkpoint, restore
@@ -30,14 +33,20 @@ class Method:
     Attributes:
         make: Builds the agent from a typed configuration, an environment and a device.
         sections: The sections of a configuration that are the method's own, by name.
+        mixes: Whether its minibatches may hold rows of a data set.
     """
 
     make: Callable[[Any, EnvBase, torch.device], Agent]
     sections: Mapping[str, type[Section]]
+    mixes: bool = True
 
 
 AGENTS = {
     "aca": Method(make_aca, {"aca": ACASettings, "optim": ACAOptim}),
+    "dacer": Method(make_dacer, {"dacer": DACERSettings, "variant": Variant, "optim": DACEROptim}),
+    "dipo": Method(
+        make_dipo, {"dipo": DIPOSettings, "variant": Variant, "optim": DIPOOptim}, mixes=False
+    ),
     "rlpd": Method(make_rlpd, {"rlpd": RLPDSettings, "variant": Variant, "optim": RLPDOptim}),
     "sac": Method(make_sac, {"sac": SACSettings, "optim": SACOptim}),
 }

@@ -47,12 +47,6 @@ class DiffusionOptim(DecayOptim):
     actor_lr_end: NonNegative
 
 
-class Variant(Section):
-    """The section `variant`: whose code the settings are from."""
-
-    name: str
-
-
 def make_schedule(settings: DiffusionSettings) -> NoiseSchedule:
     """The noise schedule; the linear one is so many times linspace(1e-4, 0.999)."""
     if settings.schedule == "linear":

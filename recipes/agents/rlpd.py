@@ -55,12 +55,6 @@ class RLPDSettings(Section):
         return self
 
 
-class Variant(Section):
-    """The section `variant`: whose code the settings are from."""
-
-    name: str
-
-
 class RLPDOptim(Optim):
     """The section `optim` of RLPD."""
 
