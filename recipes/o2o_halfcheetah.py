@@ -54,9 +54,7 @@ class OfflineToOnlineConfig(RunConfig):
     def _method(self) -> OfflineToOnlineConfig:
         if not AGENTS[self.algo.name].mixes:
             able = sorted(name for name, method in AGENTS.items() if method.mixes)
-            self.refuse(
-                "algo.name", f"one of {able}, as it changes the rows of its buffer"
-            )
+            self.refuse("algo.name", f"one of {able}, as it changes the rows of its buffer")
         return self
 
     @model_validator(mode="before")

@@ -47,6 +47,8 @@ TINY_SIZES = {
         "dacer.alpha_interval=20",
     ],
     "dipo": ["dipo.num_cells=[16,16]", "dipo.num_steps=4", "dipo.num_gradient_steps=5"],
+    "qsm": ["qsm.num_cells=[16,16]", "qsm.num_steps=3", "qsm.num_candidates=3"],
+    "qvpo": ["qvpo.num_cells=[16,16]", "qvpo.num_steps=3", "qvpo.num_candidates=3"],
     "rlpd": [
         "rlpd.num_cells=[16,16]",
         "rlpd.num_qvalue_nets=3",
@@ -54,6 +56,13 @@ TINY_SIZES = {
         "optim.utd_ratio=0.4",
     ],
     "sac": ["sac.num_cells=[16,16]"],
+    "sdac": [
+        "sdac.num_cells=[16,16]",
+        "sdac.num_steps=3",
+        "sdac.num_candidates=3",
+        "sdac.num_proposals=4",
+        "sdac.alpha_interval=20",
+    ],
 }
 TINY = {algo: [f"algo={algo}", *TINY_RUN, *sizes] for algo, sizes in TINY_SIZES.items()}
 

@@ -32,7 +32,7 @@ ALLOWED = {
     "critic": {"checks", "functional"},
     "custom_critic": {"functional", "critic"},
     "actor": {"checks", "functional", "schedule", "chain", "critic", "custom_critic"},
-    "td_loss": {"checks"},
+    "td_loss": {"checks", "functional"},
     "loss": {
         "checks",
         "functional",

@@ -18,12 +18,12 @@ from torchrl_aca import functional as F
 from torchrl_aca.actor import CriticGuidedDenoisingActor
 from torchrl_aca.checks import check_at_least, check_choice
 from torchrl_aca.critic import NoiseLevelCriticBase
-from torchrl_aca.td_loss import TDLoss, next_key
+from torchrl_aca.td_loss import OpenLoopAlpha, TDLoss, next_key
 
 __all__ = ["ACALoss"]
 
 
-class ACALoss(TDLoss):
+class ACALoss(OpenLoopAlpha, TDLoss):
     """Loss module of *Actor-Critic without Actor* (arXiv 2509.21022).
 
     Three losses, each to be had alone as a TensorDict of its ``loss_*`` entry and metrics:
@@ -133,7 +133,6 @@ class ACALoss(TDLoss):
 
     actor_network: CriticGuidedDenoisingActor
     qvalue_network: NoiseLevelCriticBase
-    target_entropy: Tensor
 
     def __init__(
         self,
@@ -166,20 +165,16 @@ class ACALoss(TDLoss):
         # The actor is no submodule: its parameters are listed below, and only once.
         self.__dict__["actor_network"] = actor_network
         self.convert_to_functional(critic, "qvalue_network", create_target_params=delay_qvalue)
-        self.log_alpha = actor_network.log_alpha
         self.register_buffer("guidance_weight", actor_network.guidance_weight)
         self.delay_qvalue = delay_qvalue
         self.num_target_candidates = num_target_candidates
         self.noise_level_target = noise_level_target
-        self.entropy_noise_scale = entropy_noise_scale
         self.reward_scale = reward_scale
         self.loss_function = loss_function
         self.reduction = reduction or "mean"
         self.use_prioritized_weights = use_prioritized_weights
         self.use_given_draws = use_given_draws
-        if target_entropy == "auto":
-            target_entropy = -target_entropy_scale * actor_network.action_dim
-        self.register_buffer("target_entropy", self.log_alpha.new_tensor(target_entropy))
+        self._init_alpha(target_entropy, target_entropy_scale, entropy_noise_scale)
         self.set_keys(
             action=actor_network.out_keys[0],
             state_action_value=critic.value_key,
@@ -223,29 +218,6 @@ class ACALoss(TDLoss):
         metrics = {"noisy_value": value.detach().mean()}
         weights = self._maybe_get_priority_weight(tensordict)
         return self._output("loss_noise_level", error, tensordict, metrics, weights)
-
-    def alpha_loss(self, tensordict: TensorDictBase | None = None) -> TensorDict:
-        """Open-loop schedule of the exploration noise; depends on no data.
-
-        Args:
-            tensordict: gives the shape of the loss where ``reduction="none"``; otherwise unused.
-        """
-        actor = self.actor_network
-        with torch.no_grad():
-            entropy = F.surrogate_entropy(
-                self.log_alpha, actor.action_dim, self.entropy_noise_scale
-            )
-        loss = self.log_alpha * (entropy - self.target_entropy)
-        alpha = self.log_alpha.detach().exp()
-        if self.reduction == "none" and tensordict is not None:
-            shape = tensordict.batch_size
-            return TensorDict({"loss_alpha": loss.expand(shape)}, batch_size=shape)
-        metrics = {
-            "alpha": alpha,
-            "entropy": entropy,
-            "exploration_std": alpha * actor.exploration_noise,
-        }
-        return TensorDict({"loss_alpha": loss, **metrics})
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
@@ -309,7 +281,7 @@ class ACALoss(TDLoss):
     def _tie(self) -> None:
         """The actor holds the loss's parameters and buffers."""
         super()._tie()
-        self.actor_network.log_alpha = self.log_alpha
+        self._tie_alpha()
         self.guidance_weight = self.actor_network.guidance_weight
 
     def _apply(self, fn: Callable) -> ACALoss:

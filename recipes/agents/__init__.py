@@ -15,9 +15,13 @@ from torchrl.envs import EnvBase
 
 from agents.aca import ACAOptim, ACASettings, make_aca
 from agents.dacer import DACEROptim, DACERSettings, make_dacer
+from agents.diffusion import DiffusionOptim
 from agents.dipo import DIPOOptim, DIPOSettings, make_dipo
+from agents.qsm import QSMSettings, make_qsm
+from agents.qvpo import QVPOSettings, make_qvpo
 from agents.rlpd import RLPDOptim, RLPDSettings, make_rlpd
 from agents.sac import SACOptim, SACSettings, make_sac
+from agents.sdac import SDACOptim, SDACSettings, make_sdac
 from agents.variant import Variant
 from torchrl_aca.errors import RunError
 from torchrl_aca.training.agent import Agent
@@ -47,8 +51,11 @@ AGENTS = {
     "dipo": Method(
         make_dipo, {"dipo": DIPOSettings, "variant": Variant, "optim": DIPOOptim}, mixes=False
     ),
+    "qsm": Method(make_qsm, {"qsm": QSMSettings, "variant": Variant, "optim": DiffusionOptim}),
+    "qvpo": Method(make_qvpo, {"qvpo": QVPOSettings, "variant": Variant, "optim": DiffusionOptim}),
     "rlpd": Method(make_rlpd, {"rlpd": RLPDSettings, "variant": Variant, "optim": RLPDOptim}),
     "sac": Method(make_sac, {"sac": SACSettings, "optim": SACOptim}),
+    "sdac": Method(make_sdac, {"sdac": SDACSettings, "optim": SDACOptim}),
 }
 
 Recipe = TypeVar("Recipe", bound=RunConfig)

@@ -7,6 +7,9 @@ from torchrl_aca.baselines.dipo import DIPOLoss
 from torchrl_aca.baselines.ensemble import EnsembleMLP
 from torchrl_aca.baselines.ensemble_sac import EnsembleSACLoss
 from torchrl_aca.baselines.networks import NoiseNetwork, TwinCritic
+from torchrl_aca.baselines.qsm import QSMLoss
+from torchrl_aca.baselines.qvpo import QVPOLoss
+from torchrl_aca.baselines.sdac import SDACLoss
 
 __all__ = [
     "DACERLoss",
@@ -16,5 +19,8 @@ __all__ = [
     "EnsembleMLP",
     "EnsembleSACLoss",
     "NoiseNetwork",
+    "QSMLoss",
+    "QVPOLoss",
+    "SDACLoss",
     "TwinCritic",
 ]

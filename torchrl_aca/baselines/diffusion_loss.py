@@ -46,8 +46,12 @@ class DiffusionPolicyLoss(TDLoss):
             in env units), ``noise_level`` (from ``1..T``) and ``noise`` (standard normal, shape of
             the action). Default: True.
 
+    Attributes:
+        needs_schedule: whether the loss noises actions, for which the policy needs a schedule.
+
     Raises:
-        ValueError: if the policy has no critics, or a number is out of range.
+        ValueError: if the policy has no critics, or not the chain that the loss needs, or a number
+            is out of range.
     """
 
     @dataclass
@@ -78,6 +82,7 @@ class DiffusionPolicyLoss(TDLoss):
         terminated: NestedKey = "terminated"
         priority_weight: NestedKey = "priority_weight"
 
+    needs_schedule = True
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
     loss_names: tuple[str, ...] = ("loss_qvalue", "loss_actor")
@@ -104,6 +109,11 @@ class DiffusionPolicyLoss(TDLoss):
         super().__init__()
         if actor_network.critic is None:
             raise ValueError("The policy must have critics: build it with critic=... .")
+        if self.needs_schedule and actor_network.schedule is None:
+            raise ValueError(
+                f"{type(self).__name__} noises actions: build the policy with a NoiseSchedule, not "
+                "with step sizes."
+            )
         if num_target_candidates is None:
             num_target_candidates = actor_network.num_candidates
         check_at_least(1, num_target_candidates=num_target_candidates)

@@ -117,12 +117,14 @@ class NoiseNetwork(nn.Module):
         Args:
             features: what :meth:`encode` returned for ``B`` states.
             action: noisy actions of shape ``(*N, B, A)``; ``*N`` is empty or ``N`` candidates.
-            level: integers from ``1..T`` of shape ``()`` or ``(B,)``; without an embedding, any.
+            level: integers from ``1..T`` of shape ``()``, ``(B,)`` or ``(*N, B)``; without an
+                embedding, any.
         """
         state_share, level_share = features
         share = state_share
         if self.embedding != "none":
-            share = share + level_share.index_select(0, level.reshape(-1) - 1)
+            level_share = level_share.index_select(0, level.reshape(-1) - 1)
+            share = share + level_share.reshape(*level.shape, -1)
         _, action_weight, _ = self._first.weight.split(self._first_sizes, dim=1)
         x = action @ action_weight.T + share
         for layer in self._others:
