@@ -52,7 +52,15 @@ BANDIT = {
         "aca.num_candidates=32",
         "aca.reward_scale=1",
     ],
-    "dacer": ["optim.lr=1e-2", "optim.actor_lr=1e-2", "dacer.reward_scale=1"],
+    # Little noise and a slow policy: what a wrong critic drives to the bounds has no gradient there.
+    "dacer": [
+        "variant=dacer_sdac_repo",
+        "optim.lr=1e-2",
+        "optim.actor_lr=1e-3",
+        "dacer.num_cells=[64,64]",
+        "dacer.linear_scale=0.01",
+        "dacer.initial_scale=0.1",
+    ],
     "dipo": ["optim.lr=1e-2", "optim.actor_lr=1e-2"],
     "qsm": ["optim.lr=1e-2", "optim.actor_lr=1e-2", "qsm.num_steps=20", "qsm.num_candidates=32"],
     "qvpo": ["optim.lr=1e-2", "optim.actor_lr=1e-2", "qvpo.num_candidates=32"],
