@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, is_tensor_collection
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.data import Bounded
@@ -21,6 +21,9 @@ from torchrl_aca.baselines import (
     EnsembleMLP,
     EnsembleSACLoss,
     NoiseNetwork,
+    QSMLoss,
+    QVPOLoss,
+    SDACLoss,
     TwinCritic,
 )
 
@@ -153,38 +156,61 @@ def make_rlpd_data(*batch):
 
 # --- diffusion policies ---------------------------------------------------------------------------
 
+LANGEVIN = [1 - step / NUM_STEPS for step in range(NUM_STEPS)]
 
-def make_diffusion_policy(
-    state="observation", action="action", critic=None, num_outputs=1, spec=True, **kwargs
-):
-    """A small policy in float64 with its critics."""
-    sizes = OBSERVATION_DIM, ACTION_DIM
-    mlp = {"num_cells": (6, 5), "dtype": torch.float64}
-    network = NoiseNetwork(*sizes, num_steps=NUM_STEPS, embedding_dim=4, **mlp)
-    return DiffusionPolicy(
-        network,
-        NoiseSchedule.cosine(NUM_STEPS),
-        critic=critic or TwinCritic(*sizes, num_outputs=num_outputs, **mlp),
-        spec=Bounded(LOW, HIGH, (ACTION_DIM,), dtype=torch.float64) if spec else None,
-        in_keys=[state],
-        out_keys=[action],
-        **kwargs,
+
+def make_diffusion_policy(state="observation", action="action", critic=None, chain=None, **kwargs):
+    """A policy in float64, with bounds that are not [-1, 1]."""
+    sizes = {"num_cells": (6, 5), "dtype": torch.float64}
+    if critic is None:
+        critic = TwinCritic(OBSERVATION_DIM, ACTION_DIM, **sizes)
+    embedding = "none" if chain is LANGEVIN else "mlp"
+    network = NoiseNetwork(
+        OBSERVATION_DIM,
+        ACTION_DIM,
+        num_steps=NUM_STEPS,
+        embedding=embedding,
+        embedding_dim=4,
+        **sizes,
     )
+    spec = Bounded(LOW, HIGH, (ACTION_DIM,), dtype=torch.float64)
+    kwargs = {"num_candidates": 3, "critic": critic, "spec": spec, **kwargs}
+    chain = NoiseSchedule.cosine(NUM_STEPS) if chain is None else chain
+    return DiffusionPolicy(network, chain, in_keys=[state], out_keys=[action], **kwargs)
 
 
-def with_targets_apart(loss):
-    """A loss whose targets differ from what they follow, with the discount of the tests."""
+def make_diffusion_loss(loss_class, state="observation", action="action", policy=None, **kwargs):
+    """A loss with no parameter at a special value, and targets apart from the online networks."""
+    loss = loss_class(policy or make_diffusion_policy(state, action), **kwargs)
     loss.make_value_estimator(gamma=0.875)
     SoftUpdate(loss, tau=0.1)
-    for name, param in loss.named_parameters():
-        if "network" in name:
-            param.data.add_(0.1 * torch.randn_like(param))
+    for params in filter(is_tensor_collection, loss.children()):
+        for param in params.values(True, True):
+            param.data.add_(0.3 * torch.randn_like(param))
     return loss
 
 
-def make_dipo(state="observation", action="action", critic=None, **kwargs):
-    policy = make_diffusion_policy(state, action, critic)
-    return with_targets_apart(DIPOLoss(policy, num_gradient_steps=4, **kwargs))
+def make_qsm(state="observation", action="action", **kwargs):
+    policy = kwargs.pop("policy", None)
+    if policy is None:
+        policy = make_diffusion_policy(state, action, chain=LANGEVIN)
+    return make_diffusion_loss(QSMLoss, policy=policy, **kwargs)
+
+
+def make_qvpo(state="observation", action="action", **kwargs):
+    return make_diffusion_loss(QVPOLoss, state, action, **kwargs)
+
+
+def make_sdac(state="observation", action="action", policy=None, **kwargs):
+    if policy is None:
+        policy = make_diffusion_policy(state, action, exploration_noise=0.1, alpha_init=2.0)
+    return make_diffusion_loss(SDACLoss, policy=policy, **{"num_proposals": 5, **kwargs})
+
+
+def make_dipo(state="observation", action="action", policy=None, **kwargs):
+    if policy is None:
+        policy = make_diffusion_policy(state, action, num_candidates=1)
+    return make_diffusion_loss(DIPOLoss, policy=policy, **{"num_gradient_steps": 4, **kwargs})
 
 
 def make_dipo_data(*batch):
@@ -193,10 +219,17 @@ def make_dipo_data(*batch):
     return data.set("best_action", LOW + unit * (HIGH - LOW))
 
 
-def make_dacer(state="observation", action="action", critic=None, **kwargs):
-    noise = {"exploration_noise": 0.1, "alpha_init": 3.0, "clip_action": True}
-    policy = make_diffusion_policy(state, action, critic, num_outputs=2, **noise)
-    return with_targets_apart(DACERLoss(policy, num_entropy_samples=30, **kwargs))
+def make_dacer_critic(**kwargs):
+    sizes = {"num_cells": (6, 5), "dtype": torch.float64, **kwargs}
+    return TwinCritic(OBSERVATION_DIM, ACTION_DIM, num_outputs=2, **sizes)
+
+
+def make_dacer(state="observation", action="action", policy=None, **kwargs):
+    if policy is None:
+        noise = {"exploration_noise": 0.1, "alpha_init": 2.0, "clip_action": True}
+        critic = make_dacer_critic()
+        policy = make_diffusion_policy(state, action, critic, num_candidates=1, **noise)
+    return make_diffusion_loss(DACERLoss, policy=policy, **{"num_entropy_samples": 30, **kwargs})
 
 
 # --- all losses -----------------------------------------------------------------------------------
@@ -251,6 +284,27 @@ CASES = {
         make_dipo_data,
         ("qvalue_loss", "actor_loss"),
         frozenset({"pred_value", "target_value", "improvement"}),
+        frozenset({"td_error"}),
+    ),
+    "qsm": LossCase(
+        make_qsm,
+        make_rlpd_data,
+        ("qvalue_loss", "actor_loss"),
+        frozenset({"pred_value", "target_value", "gradient_norm"}),
+        frozenset({"td_error"}),
+    ),
+    "qvpo": LossCase(
+        make_qvpo,
+        make_rlpd_data,
+        ("qvalue_loss", "actor_loss"),
+        frozenset({"pred_value", "target_value", "policy_weight"}),
+        frozenset({"td_error"}),
+    ),
+    "sdac": LossCase(
+        make_sdac,
+        make_rlpd_data,
+        ("qvalue_loss", "actor_loss", "alpha_loss"),
+        frozenset({"pred_value", "target_value", "alpha", "entropy", "exploration_std"}),
         frozenset({"td_error"}),
     ),
     "rlpd": LossCase(

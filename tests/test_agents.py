@@ -52,7 +52,7 @@ BANDIT = {
         "aca.num_candidates=32",
         "aca.reward_scale=1",
     ],
-    # Little noise and a slow policy: what a wrong critic drives to the bounds has no gradient there.
+    # Little noise and a slow policy: what a wrong critic drives to the bounds stays there.
     "dacer": [
         "variant=dacer_sdac_repo",
         "optim.lr=1e-2",
@@ -68,7 +68,13 @@ BANDIT = {
         "dipo.num_steps=20",
         "dipo.num_gradient_steps=60",
     ],
-    "qsm": ["optim.lr=1e-2", "optim.actor_lr=1e-2", "qsm.num_steps=20", "qsm.num_candidates=32"],
+    "qsm": [
+        "optim.lr=1e-2",
+        "optim.actor_lr=1e-2",
+        "qsm.num_cells=[64,64,64]",
+        "qsm.num_steps=20",
+        "qsm.num_candidates=32",
+    ],
     "qvpo": ["optim.lr=1e-2", "optim.actor_lr=1e-2", "qvpo.num_candidates=32"],
     "rlpd": ["optim.lr=1e-2", "optim.actor_lr=1e-2", "rlpd.alpha_init=0.3"],
     "sac": ["optim.lr=1e-2", "sac.alpha_init=0.3", "sac.reward_scale=1"],

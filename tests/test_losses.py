@@ -13,9 +13,27 @@ from torch import nn
 from torchrl.modules import ValueOperator
 from torchrl.objectives import HardUpdate, SoftUpdate
 
-from loss_cases import ACTION_DIM, CASES, OBSERVATION_DIM, make_actor, make_policy
+from loss_cases import (
+    ACTION_DIM,
+    CASES,
+    LANGEVIN,
+    OBSERVATION_DIM,
+    make_actor,
+    make_diffusion_policy,
+    make_policy,
+)
 from torchrl_aca import ACALoss
-from torchrl_aca.baselines import DiffusionPolicyLoss, EnsembleMLP, EnsembleSACLoss, TwinCritic
+from torchrl_aca.baselines import (
+    DACERLoss,
+    DiffusionPolicyLoss,
+    DIPOLoss,
+    EnsembleMLP,
+    EnsembleSACLoss,
+    QSMLoss,
+    QVPOLoss,
+    SDACLoss,
+    TwinCritic,
+)
 
 NEXT_KEYS = ("reward", "done", "terminated")
 COPIES = {"deepcopy": copy.deepcopy, "pickle": lambda loss: pickle.loads(pickle.dumps(loss))}
@@ -49,6 +67,11 @@ def assert_tied(loss):
     for named in (loss.named_parameters, loss.named_buffers):
         tensors = [tensor.data_ptr() for _, tensor in named()]
         assert len(tensors) == len(set(tensors))
+    if hasattr(loss, "average_actor_network"):
+        average, targets = loss.average_actor_network, loss.target_policy_network_params
+        tied = {p.data_ptr() for p in average.network.parameters()}
+        assert tied == {p.data_ptr() for p in targets.values(True, True)}
+        assert average.critic is network and average.log_alpha is loss.actor_network.log_alpha
     if isinstance(loss, ACALoss):
         actor = loss.actor_network
         assert actor.critic is network and actor.log_alpha is loss.log_alpha
@@ -189,9 +212,10 @@ def test_keyword_arguments_give_what_a_tensordict_gives(case, reduction):
 def test_select_out_keys_leaves_the_chosen_ones(case):
     loss, data = case.make(), case.data(6)
     expected = seeded(loss, data.select(*loss.in_keys))
-    loss.select_out_keys("loss_qvalue", "pred_value")
-    chosen = seeded(lambda: loss(**as_kwargs(loss, data)))
-    assert chosen == (expected["loss_qvalue"], expected["pred_value"])
+    chosen = "loss_qvalue", min(case.metrics)
+    loss.select_out_keys(*chosen)
+    values = seeded(lambda: loss(**as_kwargs(loss, data)))
+    assert values == tuple(expected[key] for key in chosen)
 
 
 IN_KEYS = [(name, key) for name in CASES for key in CASES[name].make().in_keys]
@@ -323,28 +347,44 @@ class ShiftedEnsemble(EnsembleMLP):
         return super().forward(*inputs) + self.shift
 
 
-class ShiftedTwins(TwinCritic):
-    """Critics of a diffusion policy whose values, of DACER the means, are shifted by a buffer."""
+class ShiftedTwin(TwinCritic):
+    """Critics of a diffusion policy whose values are shifted by a buffer."""
 
-    def __init__(self, num_outputs):
-        sizes = {"num_outputs": num_outputs, "num_cells": (6,), "dtype": torch.float64}
-        super().__init__(OBSERVATION_DIM, ACTION_DIM, **sizes)
+    def __init__(self, *sizes, **kwargs):
+        super().__init__(*sizes, **kwargs)
         self.register_buffer("shift", torch.zeros(2, dtype=torch.float64))
 
     def evaluate(self, features, action):
         values = super().evaluate(features, action)
         if self.num_outputs == 1:
             return values + self.shift
-        return values + self.shift[:, None] * values.new_tensor([1.0, 0.0])
+        return values + self.shift[:, None] * values.new_tensor([1.0, 0.0])  # of DACER the means
+
+
+DIFFUSION = {
+    "dacer": DACERLoss,
+    "dipo": DIPOLoss,
+    "qsm": QSMLoss,
+    "qvpo": QVPOLoss,
+    "sdac": SDACLoss,
+}
 
 
 def make_shifted(name):
     if name == "aca":
         return ACALoss(make_actor(ShiftedCritic(), action_dim=ACTION_DIM))
-    if name != "rlpd":
-        loss = CASES[name].make(critic=ShiftedTwins(num_outputs=2 if name == "dacer" else 1))
-        loss.make_value_estimator(gamma=0.99)
-        return loss
+    if name in DIFFUSION:
+        critic = ShiftedTwin(
+            OBSERVATION_DIM,
+            ACTION_DIM,
+            num_outputs=2 if name == "dacer" else 1,
+            num_cells=(6,),
+            dtype=torch.float64,
+        )
+        chain = LANGEVIN if name == "qsm" else None
+        num_candidates = 1 if name in ("dacer", "dipo") else 3
+        policy = make_diffusion_policy(critic=critic, chain=chain, num_candidates=num_candidates)
+        return DIFFUSION[name](policy, reward_scale=1.0)
     critics = ValueOperator(ShiftedEnsemble(), in_keys=["observation", "action"])
     return EnsembleSACLoss(make_policy(), critics)
 
@@ -406,10 +446,10 @@ def test_batch_norm_of_a_critic_counts_online_rows_and_serves_the_targets():
 # --- compilation ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("name", "given"),
-    [*((name, ()) for name in CASES), ("aca", ("noise", "noise_level", "next_action"))],
-)
+COMPILED = [("aca", ("noise", "noise_level", "next_action")), *((name, ()) for name in CASES)]
+
+
+@pytest.mark.parametrize(("name", "given"), COMPILED)
 def test_compiled_losses_equal_eager_ones(name, given):
     case = CASES[name]
     loss, data = case.make(), case.data(4)

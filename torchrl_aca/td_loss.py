@@ -156,7 +156,7 @@ class TDLoss(LossModule):
         return clone
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """As a copy; pickle gives shared memory back as memory of its own."""
+        """A pickle holds parameters and their networks, and not that they are the same."""
         super().__setstate__(state)
         self._tie()
 
