@@ -7,8 +7,28 @@ import pytest
 import torch
 
 import oracle
+import oracle_diffusion as numpy_of
+from agents.dipo import cut_gradients
+from loss_cases import HIGH, LOW, make_dipo, make_dipo_data
+from o2o_halfcheetah import train as train_with_data
+from online_mujoco import train
+from recipe_cases import TINY, batch_of, composed
+from test_agents import built
+from test_diffusion_losses import (
+    BATCH,
+    EXACT,
+    array,
+    assert_policy_loss,
+    critics_of,
+    make_data,
+    noised,
+    unit,
+)
+from torchrl_aca.baselines import DIPOLoss
 from torchrl_aca.baselines.dipo import improve_actions
 from torchrl_aca.chain import StepRunner
+from torchrl_aca.errors import RunError
+from torchrl_aca.training.checkpoint import read_checkpoint
 
 # --- the action gradient --------------------------------------------------------------------------
 
@@ -92,3 +112,158 @@ def test_a_compiled_step_gives_the_same_actions():
 def test_numbers_out_of_range_are_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         improve_actions(hills, torch.zeros(2, 1), **changes)
+
+
+# --- the losses -----------------------------------------------------------------------------------
+
+
+def data_of(loss):
+    """Transitions with draws, and best actions apart from those that were taken."""
+    data = make_data(loss)
+    return data.set("best_action", make_dipo_data(BATCH)["best_action"])
+
+
+def test_actions_climb_the_smaller_critic_of_the_oracle():
+    loss = make_dipo(num_gradient_steps=6, action_lr=0.05, action_max_norm=0.4)
+    data = data_of(loss)
+    before, state = data.clone(), array(data["observation"])
+
+    def gradient(action):
+        return numpy_of.score_target(critics_of(loss), state, action, 1.0, "min")
+
+    improved = loss.improve(data)
+    expected = oracle_improve(gradient, array(unit(data["best_action"])), 6, 0.05, 0.4)
+    np.testing.assert_allclose(array(unit(improved)), expected, rtol=1e-7, atol=1e-9)
+    assert (data == before).all() and not improved.requires_grad
+    assert all(p.grad is None for p in loss.parameters())
+
+
+def test_improved_actions_are_worth_more_and_stay_within_the_bounds():
+    loss = make_dipo(num_gradient_steps=30)
+    data = data_of(loss)
+    critic, state = loss.qvalue_network, data["observation"]
+    before = critic(state, unit(data["best_action"])).amin(-1)
+    for _ in range(5):
+        data["best_action"] = loss.improve(data)
+    assert (critic(state, unit(data["best_action"])).amin(-1) > before).all()
+    assert ((data["best_action"] >= LOW) & (data["best_action"] <= HIGH)).all()
+
+
+def test_the_policy_imitates_the_best_actions_as_in_the_oracle():
+    loss = make_dipo()
+    data = data_of(loss)
+    best = array(unit(data["best_action"]))
+    noisy, _ = noised(best, data, loss.actor_network.schedule)
+    level = array(data["noise_level"]).astype(int)
+    output, saved = numpy_of.policy(loss.policy_network, array(data["observation"]), noisy, level)
+    expected, upstream = numpy_of.regression(output, array(data["noise"]), 0.5)
+    out = loss.actor_loss(data)
+    assert_policy_loss(loss, out["loss_actor"], saved, upstream, expected)
+    moved = np.abs(best - array(unit(data["action"]))).mean()
+    np.testing.assert_allclose(out["improvement"].item(), moved, **EXACT)
+
+
+def test_without_a_best_action_the_action_taken_is_the_best():
+    loss = make_dipo()
+    data = data_of(loss)
+    data["best_action"] = data["action"]
+    expected = loss.actor_loss(data)["loss_actor"], loss.improve(data)
+    data = data.exclude("best_action")
+    torch.testing.assert_close((loss.actor_loss(data)["loss_actor"], loss.improve(data)), expected)
+
+
+def test_the_target_is_of_the_policys_moving_average():
+    loss, data = make_dipo(), make_dipo_data(BATCH)
+    torch.manual_seed(3)
+    expected = loss.qvalue_loss(data)["loss_qvalue"]
+    torch.manual_seed(3)
+    data["next_action"] = loss.average_actor_network.sample(data["next", "observation"])
+    assert loss.qvalue_loss(data)["loss_qvalue"] == expected
+    torch.manual_seed(3)
+    data["next_action"] = loss.actor_network.sample(data["next", "observation"])
+    assert (loss.qvalue_loss(data)["loss_qvalue"] - expected).abs() > 1e-6
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"num_gradient_steps": 0}, "num_gradient_steps >= 1"),
+        ({"action_lr": 0.0}, "action_lr > 0"),
+        ({"action_max_norm": 0.0}, "action_max_norm > 0"),
+    ],
+)
+def test_settings_out_of_range_are_refused(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        DIPOLoss(make_dipo().actor_network, **kwargs)
+
+
+# --- the agent ------------------------------------------------------------------------------------
+
+
+def test_each_network_has_its_gradient_cut_alone():
+    stack = torch.nn.Parameter(torch.zeros(2, 3, 4)), torch.nn.Parameter(torch.zeros(2, 1, 4))
+    optimizer = torch.optim.SGD(stack, lr=1.0)
+    cut_gradients(optimizer, 2.0, stacked=True)
+    long, short = torch.randn(16), 0.1 * torch.randn(16)
+    for gradients in (torch.stack([long, short]), torch.stack([short, 9 * long])):
+        stack[0].grad, stack[1].grad = gradients[:, :12].view(2, 3, 4), gradients[:, 12:, None].mT
+        before = [param.detach().clone() for param in stack]
+        optimizer.step()
+        moved = [a - b for a, b in zip(before, stack, strict=True)]
+        for member, gradient in enumerate(gradients):
+            got = torch.cat([part[member].flatten() for part in moved])
+            expected = gradient * min(1.0, 2.0 / gradient.norm().item())
+            torch.testing.assert_close(got, expected)
+
+
+def test_a_single_network_is_cut_as_a_whole():
+    parameters = [torch.nn.Parameter(torch.zeros(3, 4)), torch.nn.Parameter(torch.zeros(3))]
+    optimizer = torch.optim.SGD(parameters, lr=1.0)
+    cut_gradients(optimizer, 0.5, stacked=False)
+    for parameter in parameters:
+        parameter.grad = torch.ones_like(parameter)
+    optimizer.step()
+    for parameter in parameters:
+        torch.testing.assert_close(parameter.data, torch.full_like(parameter, -0.5 / 15**0.5))
+
+
+def test_critics_are_followed_at_every_update_and_the_policy_at_every_second():
+    agent = built("dipo")
+    loss, moved = agent.state["loss"], []
+    for number in range(4):
+        before = {
+            name: getattr(loss, f"target_{name}_params").clone()
+            for name in ("qvalue_network", "policy_network")
+        }
+        agent.update(batch_of(number))
+        for name, target in before.items():
+            expected = target.lerp(getattr(loss, f"{name}_params").data, 0.005)
+            after = getattr(loss, f"target_{name}_params")
+            if (after == target).all():
+                continue
+            torch.testing.assert_close(after.data, expected.data)
+            moved.append((number, name[:6]))
+    assert moved == [(0, "qvalue"), (0, "policy"), (1, "qvalue"), (2, "qvalue"), (2, "policy"),
+                     (3, "qvalue")]  # fmt: skip
+
+
+def test_a_run_keeps_improved_actions_in_the_rows_that_it_sampled(tmp_path):
+    run_dir = tmp_path / "run"
+    train(composed(*TINY["dipo"], f"run_dir={run_dir}", "optim.total_updates=10"))
+    rows = read_checkpoint(run_dir)["parts"]["buffer"]["rows"]
+    moved = (rows["best_action"] - rows["action"]).abs().amax(-1)
+    # Ten batches of 16 of some 250 rows; a step moves a coordinate about 0.03, and there are five.
+    assert 80 < (moved > 0).sum() < 160
+    assert moved.max() > 0.1
+
+
+def test_a_mixture_is_refused_before_any_work(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    cfg = composed(
+        "algo=dipo", "dataset=nowhere", "generate={tier: random}", name="o2o_halfcheetah"
+    )
+    with pytest.raises(
+        RunError, match="algo.name='dipo': expected one of .'aca'.*changes the rows"
+    ):
+        train_with_data(cfg)
+    assert not list(tmp_path.iterdir())

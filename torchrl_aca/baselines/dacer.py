@@ -187,7 +187,8 @@ class DACERLoss(DiffusionPolicyLoss):
         rows = self._next_rows(tensordict)
         with self._critics(self._target_params()):
             mean, std = self._gaussians(*rows)
-        draw = mean + std * torch.randn_like(mean).clamp(-3, 3)
+        noise = torch.randn(mean.shape, dtype=mean.dtype, device=mean.device)
+        draw = mean + std * noise.clamp(-3, 3)
         smaller = mean.argmin(-1, keepdim=True)
         batch = tensordict[self.tensor_keys.action].shape[:-1]
         target, target_draw = (
