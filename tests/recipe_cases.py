@@ -47,8 +47,18 @@ TINY_SIZES = {
         "dacer.alpha_interval=20",
     ],
     "dipo": ["dipo.num_cells=[16,16]", "dipo.num_steps=4", "dipo.num_gradient_steps=5"],
-    "qsm": ["qsm.num_cells=[16,16]", "qsm.num_steps=3", "qsm.num_candidates=3"],
-    "qvpo": ["qvpo.num_cells=[16,16]", "qvpo.num_steps=3", "qvpo.num_candidates=3"],
+    "qsm": [
+        "qsm.num_cells=[16,16]",
+        "qsm.num_steps=3",
+        "qsm.num_candidates=3",
+        "qsm.num_target_candidates=2",
+    ],
+    "qvpo": [
+        "qvpo.num_cells=[16,16]",
+        "qvpo.num_steps=3",
+        "qvpo.num_candidates=3",
+        "qvpo.num_target_candidates=2",
+    ],
     "rlpd": [
         "rlpd.num_cells=[16,16]",
         "rlpd.num_qvalue_nets=3",
@@ -60,6 +70,7 @@ TINY_SIZES = {
         "sdac.num_cells=[16,16]",
         "sdac.num_steps=3",
         "sdac.num_candidates=3",
+        "sdac.num_target_candidates=2",
         "sdac.num_proposals=4",
         "sdac.alpha_interval=20",
     ],

@@ -19,6 +19,7 @@ class QSMSettings(DiffusionSettings):
 
     sampler: Literal["langevin", "denoising"]
     num_candidates: Candidates
+    num_target_candidates: Candidates
     exploration_noise: NonNegative
     score_scale: Positive
     gradient_of: Literal["min", "mean"]
@@ -48,6 +49,7 @@ def make_qsm(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
         make_qsm_policy(cfg, env, device),
         score_scale=settings.score_scale,
         gradient_of=settings.gradient_of,
+        num_target_candidates=settings.num_target_candidates,
         reward_scale=settings.reward_scale,
     )
     loss.make_value_estimator(gamma=cfg.optim.gamma)

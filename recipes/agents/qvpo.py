@@ -20,6 +20,7 @@ class QVPOSettings(DiffusionSettings):
     """The section `qvpo`."""
 
     num_candidates: Candidates
+    num_target_candidates: Candidates
     weight: Literal["advantage", "cutoff"]
     num_uniform: Annotated[int, Field(ge=0, le=10**4)]
     first_entropy_coefficient: NonNegative | None
@@ -49,6 +50,7 @@ def make_qvpo_loss(cfg: Any, env: EnvBase, device: torch.device) -> QVPOLoss:
         policy,
         weight=settings.weight,
         num_uniform=settings.num_uniform,
+        num_target_candidates=settings.num_target_candidates,
         reward_scale=settings.reward_scale,
     )
     loss.make_value_estimator(gamma=cfg.optim.gamma)

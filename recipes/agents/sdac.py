@@ -26,6 +26,7 @@ class SDACSettings(DiffusionSettings):
     """The section `sdac`."""
 
     num_candidates: Candidates
+    num_target_candidates: Candidates
     num_proposals: Candidates
     inverse_temperature: NonNegative
     exploration_noise: NonNegative
@@ -57,6 +58,7 @@ def make_sdac_loss(cfg: Any, env: EnvBase, device: torch.device) -> SDACLoss:
         num_proposals=settings.num_proposals,
         inverse_temperature=settings.inverse_temperature,
         target_entropy_scale=settings.target_entropy_scale,
+        num_target_candidates=settings.num_target_candidates,
         reward_scale=settings.reward_scale,
     )
     loss.make_value_estimator(gamma=cfg.optim.gamma)

@@ -218,7 +218,9 @@ class TwinCritic(nn.Module):
         """
         _, action_weight = self._first.weight.split(self._first_sizes, dim=1)
         rows = action.reshape(-1, action.shape[-1]).expand(self.num_critics, -1, -1)
-        product = (rows @ action_weight).reshape(self.num_critics, -1, *features.shape[1:])
+        num_candidates = action.shape[:-2].numel()
+        product = rows @ action_weight
+        product = product.reshape(self.num_critics, num_candidates, *features.shape[1:])
         x = (product + features.unsqueeze(1)).flatten(1, 2)
         for layer in self._others:
             x = layer(self.activation(x))
