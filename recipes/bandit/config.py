@@ -23,6 +23,8 @@ from torchrl_aca.training.config import (
 )
 
 Method = Literal[tuple(METHODS)]
+Guided = Literal["aca", "diffusion_q", "langevin_q"]
+Rivals = Literal["sdac", "qsm", "dacer", "dipo"]
 Processes = Annotated[int, Field(ge=1, le=4096)]
 
 
@@ -98,6 +100,19 @@ class Chain(Section):
     langevin_step_size: Positive
 
 
+class Rival(Section):
+    """A diffusion policy, and how it is trained."""
+
+    schedule: Literal["linear", "cosine", "vp"]
+    clip_denoised: Clip
+    num_cells: Widths
+    lr: Positive  # of the policy; the critic's is that of all methods
+    tau: Annotated[float, Field(gt=0, le=1)]
+    actor_interval: Count
+    exploration_noise: NonNegative
+    loss: dict[str, Any]  # of the method alone; the last one is what the sweep has found
+
+
 class Sweep(Section):
     """The guidance weights to choose from."""
 
@@ -126,6 +141,7 @@ class BanditConfig(Section):
     critic: Critic
     optim: Optim
     chain: Chain
+    rivals: dict[Rivals, Rival]
     sweep: Sweep
     report: Report
 

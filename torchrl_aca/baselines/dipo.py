@@ -47,6 +47,7 @@ class DIPOLoss(DiffusionPolicyLoss):
         num_gradient_steps: steps of :meth:`improve`. Default: 30.
         action_lr: their learning rate, in [-1, 1] units. Default: 0.03.
         action_max_norm: the largest length of the batch's action gradient. Default: 0.16.
+        action_bound: actions climb within ``[-action_bound, action_bound]``. Default: 1.
         compile_step: run a step of :meth:`improve` through ``torch.compile``. Default: False.
         kwargs: those of :class:`DiffusionPolicyLoss`, without ``average_policy``.
 
@@ -85,15 +86,18 @@ class DIPOLoss(DiffusionPolicyLoss):
         num_gradient_steps: int = 30,
         action_lr: float = 0.03,
         action_max_norm: float = 0.16,
+        action_bound: float = 1.0,
         compile_step: bool = False,
         **kwargs: Any,
     ) -> None:
         check_at_least(1, num_gradient_steps=num_gradient_steps)
         check_above(0, action_lr=action_lr, action_max_norm=action_max_norm)
+        check_above(0, action_bound=action_bound)
         super().__init__(actor_network, average_policy=True, **kwargs)
         self.num_gradient_steps = num_gradient_steps
         self.action_lr = action_lr
         self.action_max_norm = action_max_norm
+        self.action_bound = action_bound
         self._run = StepRunner(compile_step)
 
     def _target_actor(self) -> DiffusionPolicy:
@@ -116,6 +120,7 @@ class DIPOLoss(DiffusionPolicyLoss):
                 num_steps=self.num_gradient_steps,
                 lr=self.action_lr,
                 max_norm=self.action_max_norm,
+                bound=self.action_bound,
                 run=self._run,
             )
         return actor.to_env(improved).reshape(best.shape)
@@ -147,9 +152,10 @@ def improve_actions(
     num_steps: int = 30,
     lr: float = 0.03,
     max_norm: float = 0.16,
+    bound: float = 1.0,
     run: Callable[..., Any] = _EAGER,
 ) -> Tensor:
-    """DIPO's action gradient: steps of a fresh Adam up the critics' value, inside [-1, 1].
+    """DIPO's action gradient: steps of a fresh Adam up the critics' value, inside a box.
 
     The gradient of the whole batch has its length cut at ``max_norm`` before Adam sees it, and
     actions are clipped after each step. Adam hardly knows the gradient's scale: each coordinate
@@ -157,12 +163,13 @@ def improve_actions(
 
     Args:
         gradient: ``action -> dQ/da`` of the same shape.
-        action: where to start, shape ``(B, A)``, in [-1, 1].
+        action: where to start, shape ``(B, A)``.
 
     Keyword Args:
         num_steps: ``K``. Default: 30.
         lr: Adam's learning rate. Default: 0.03.
         max_norm: largest length of the gradient, over all ``B * A`` numbers. Default: 0.16.
+        bound: the box is ``[-bound, bound]``. Default: 1.
         run: calls a step with its arguments; a :class:`~torchrl_aca.chain.StepRunner` to compile
             it.
 
@@ -176,7 +183,7 @@ def improve_actions(
     check_above(0, lr=lr, max_norm=max_norm)
     state = action, torch.zeros_like(action), torch.zeros_like(action)
     for count in torch.arange(1, num_steps + 1, dtype=action.dtype, device=action.device):
-        state = run(_ascend, gradient, lr, max_norm, count, *state)
+        state = run(_ascend, gradient, lr, max_norm, bound, count, *state)
     return state[0]
 
 
@@ -184,6 +191,7 @@ def _ascend(
     gradient: Callable[[Tensor], Tensor],
     lr: float,
     max_norm: float,
+    bound: float,
     count: Tensor,
     action: Tensor,
     first: Tensor,
@@ -199,4 +207,4 @@ def _ascend(
     second = betas[1] * second + (1 - betas[1]) * slope.square()
     mean = first / (1 - betas[0] ** count)
     scale = (second / (1 - betas[1] ** count)).sqrt() + eps
-    return (action + lr * mean / scale).clamp(-1, 1), first, second
+    return (action + lr * mean / scale).clamp(-bound, bound), first, second
