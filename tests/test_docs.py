@@ -24,6 +24,7 @@ from torchrl.objectives import SoftUpdate
 import torchrl_aca
 from agents import AGENTS
 from online_mujoco import train
+from recipe_cases import TINY_SIZES
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -152,15 +153,15 @@ def flat(node: DictConfig, prefix: str = "") -> dict[str, object]:
 def table_rows(page: str, section: str = "") -> list[list[str]]:
     text = (DOCS / page).read_text()
     if section:
-        text = text.partition(f"\n## {section}\n")[2].partition("\n## ")[0]
+        text = re.split(rf"^##+ {re.escape(section)}$", text, flags=re.MULTILINE)[1]
+        text = re.split("^##+ ", text, flags=re.MULTILINE)[0]
     lines = [line for line in text.splitlines() if line.startswith("| `")]
     return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines]
 
 
 def test_config_page_has_every_key_with_its_default():
-    files = [*sorted((CONFIGS / "algo").glob("*.yaml"))]
-    assert [file.stem for file in files] == ["aca", "rlpd", "sac"]
-    configs = [flat(composed(f"algo={name}")) for name in ("aca", "sac", "rlpd")]
+    order = [*dict.fromkeys(["aca", "sac", "rlpd", *AGENTS])]  # the page's
+    configs = [flat(composed(f"algo={name}")) for name in order]
     documented: dict[str, list[object]] = {}
     for key, default, *_ in table_rows("config.md"):
         documented.setdefault(key.strip("`"), []).append(yaml.safe_load(default.strip("`")))
@@ -198,9 +199,18 @@ def test_offline_config_page_has_every_key_with_its_default():
     assert documented("`import_dataset.py`") == {**importer, **unset}
 
 
-def test_config_page_has_both_variants_of_rlpd():
-    variants = flat(composed("algo=rlpd")), flat(composed("algo=rlpd", "variant=wsrl"))
-    rows = {key.strip("`"): values for key, *values, _ in table_rows("config.md", "RLPD")}
+@pytest.mark.parametrize(
+    ("section", "algo", "variant"),
+    [
+        ("RLPD", "rlpd", "wsrl"),
+        ("QSM", "qsm", "qsm_authors"),
+        ("QVPO", "qvpo", "qvpo_sdac_repo"),
+    ],
+)
+def test_config_page_has_both_variants(section, algo, variant):
+    variants = flat(composed(f"algo={algo}")), flat(composed(f"algo={algo}", f"variant={variant}"))
+    rows = {key.strip("`"): values for key, *values, _ in table_rows("config.md", section)}
+    assert rows
     differing = {key for key, value in variants[0].items() if value != variants[1][key]}
     assert differing - {"variant.name"} <= rows.keys()
     for key, values in rows.items():
@@ -216,11 +226,7 @@ def plain(value: object) -> object:
 def runs(tmp_path_factory):
     """Directories of tiny runs, by algorithm."""
     folder = tmp_path_factory.mktemp("runs")
-    sizes = {
-        "aca": ["aca.num_candidates=2", "aca.num_target_candidates=2"],
-        "sac": [],
-        "rlpd": ["optim.utd_ratio=1"],
-    }
+    sizes = {name: TINY_SIZES[name] for name in AGENTS}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         return {
@@ -229,7 +235,6 @@ def runs(tmp_path_factory):
                     f"algo={algorithm}",
                     "env=reacher",
                     f"run_dir={folder / algorithm}",
-                    f"{algorithm}.num_cells=[8]",
                     "collector.warmup_frames=250",
                     "optim.batch_size=8",
                     "optim.total_updates=2",

@@ -40,7 +40,7 @@ def reverse_sampling_target(
 class SDACLoss(OpenLoopAlpha, DiffusionPolicyLoss):
     """Loss module of SDAC, soft diffusion actor-critic.
 
-    Of *Efficient Online Reinforcement Learning for Diffusion Policies*, arXiv 2502.00361. With
+    Of *Efficient Online Reinforcement Learning for Diffusion Policy*, arXiv 2502.00361. With
     critics ``Q_i``, ``Q = min_i Q_i``, the policy's noise network ``eps`` and the ``alpha`` of its
     exploration, three losses, each to be had alone:
 
