@@ -11,7 +11,6 @@ from torchrl.objectives import SoftUpdate
 
 from bandit.config import BanditConfig
 from bandit.env import TwoDBandit
-from torchrl_aca import NoiseSchedule
 from torchrl_aca.baselines import (
     DACERLoss,
     DiffusionPolicy,
@@ -46,7 +45,7 @@ def make_loss(cfg: BanditConfig, method: str) -> DiffusionPolicyLoss:
         chain = {"clip_denoised": False, "clip_step": clip, "variance": "beta"}
     policy = DiffusionPolicy(
         NoiseNetwork(1, 2, num_steps=num_steps, num_cells=settings.num_cells),
-        getattr(NoiseSchedule, settings.schedule)(num_steps),
+        cfg.chain.make_schedule(settings.schedule),
         critic=TwinCritic(
             1,
             2,
@@ -58,7 +57,7 @@ def make_loss(cfg: BanditConfig, method: str) -> DiffusionPolicyLoss:
         deterministic_draws="fresh",
         **chain,
     )
-    loss = LOSSES[method](policy, reward_scale=1.0, **settings.loss)
+    loss = LOSSES[method](policy, reward_scale=1.0, **settings.loss, **settings.chosen)
     SoftUpdate(loss, tau=settings.tau)
     return loss
 
@@ -75,7 +74,7 @@ def train(cfg: BanditConfig, method: str, seed: int) -> DiffusionPolicy:
         name: torch.optim.Adam(network.parameters(), lr=rates[name])
         for name, network in networks.items()
     }
-    num_updates = collection.frames // collection.frames_per_batch * cfg.optim.updates_per_batch
+    num_updates = collection.frames // collection.frames_per_batch * settings.updates_per_batch
     schedulers = [
         torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, num_updates)
         for optimizer in optimizers.values()
@@ -99,7 +98,7 @@ def train(cfg: BanditConfig, method: str, seed: int) -> DiffusionPolicy:
     )
     for data in collector:
         buffer.extend(transitions(data, rewritten=best))
-        for update in range(cfg.optim.updates_per_batch):
+        for update in range(settings.updates_per_batch):
             batch = buffer.sample()
             batch["next_action"] = batch["action"]  # the last step needs none: spare the chain
             step(loss.qvalue_loss(batch), "loss_qvalue")

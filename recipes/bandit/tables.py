@@ -34,7 +34,10 @@ Row = dict[str, Any]
 
 
 def summary(rows: Sequence[Row]) -> list[Row]:
-    """Means over the seeds, one row for each method, each beside the paper's."""
+    """Means over the seeds, one row for each method, each beside the paper's.
+
+    `w` is what the reward has chosen: the guidance weight, or the one setting of a rival.
+    """
     table = []
     for method, label in METHODS.items():
         runs = [row for row in rows if row["method"] == method]
@@ -42,7 +45,7 @@ def summary(rows: Sequence[Row]) -> list[Row]:
             continue
         mean = {key: statistics.fmean(run[key] for run in runs) for key in NUMBERS}
         sums = [run["sum"] for run in runs]
-        weights = " ".join(f"{run['weight']:g}" for run in runs)
+        weights = " ".join(f"{run['weight']:g}" for run in runs if run["weight"] is not None)
         table.append(
             {"method": label, "source": f"here, {len(runs)} seeds"}
             | {key: f"{value:.3f}" for key, value in mean.items()}
