@@ -1,9 +1,10 @@
-"""Peak memory of an update beyond parameters and batch.
+"""Peak memory of an update beyond parameters and optimisers.
 
     PYTHONPATH=recipes python benchmarks/memory.py 32
+    PYTHONPATH=recipes python benchmarks/memory.py 32 sdac
 
-
-The argument is the number of target candidates; sizes are HalfCheetah's. Linux and macOS only.
+The arguments are the number of candidates and a method that has such (ACA if none is given); sizes
+are HalfCheetah's. Linux and macOS only.
 """
 
 from __future__ import annotations
@@ -12,17 +13,10 @@ import resource
 import sys
 
 import torch
-from torchrl.objectives import SoftUpdate
 
-from test_speed import make_actor, make_batch
-from torchrl_aca import ACALoss
-
-
-def update(loss: ACALoss) -> None:
-    """Both gradients of an even update."""
-    batch = make_batch("HalfCheetah")
-    for name in ("qvalue", "noise_level"):
-        getattr(loss, f"{name}_loss")(batch)[f"loss_{name}"].backward()
+from recipe import configure, make_recipe_agent
+from test_speed import make_batch
+from torchrl_aca.training.envs import make_vector_env
 
 
 def peak_mib() -> float:
@@ -31,17 +25,21 @@ def peak_mib() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
 
 
-def main(num_candidates: int) -> None:
-    """Prints how far an update raises the peak over that of an update with one candidate."""
+def main(num_candidates: int, algo: str) -> None:
+    """Prints how far two updates raise the peak over that of two updates on eight rows."""
     torch.set_num_threads(1)
-    loss = ACALoss(make_actor("HalfCheetah", "eager", num_candidates), num_target_candidates=1)
-    SoftUpdate(loss, tau=0.005)  # the loss warns where its targets have no updater
-    update(loss)
+    candidates = (f"{algo}.num_{which}candidates={num_candidates}" for which in ("", "target_"))
+    cfg = configure(f"algo={algo}", *candidates)
+    agent = make_recipe_agent(cfg, make_vector_env(cfg.env.name, 1, seed=0))
+    batch = make_batch("HalfCheetah")
+    # An even and an odd one: some losses are there at every second alone.
+    agent.update(batch[:8])
+    agent.update(batch[:8])
     before = peak_mib()
-    loss.num_target_candidates = num_candidates
-    update(loss)
-    print(f"{num_candidates} target candidates: {peak_mib() - before:.0f} MiB")
+    agent.update(batch)
+    agent.update(batch)
+    print(f"{algo}, {num_candidates} candidates: {peak_mib() - before:.0f} MiB")
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]))
+    main(int(sys.argv[1]), sys.argv[2] if len(sys.argv) > 2 else "aca")

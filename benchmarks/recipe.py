@@ -19,9 +19,9 @@ CONFIGS = Path(__file__).resolve().parents[1] / "recipes/configs"
 
 
 def configure(*overrides: str) -> RunConfig:
-    """The configuration of `python recipes/online_mujoco.py algo=aca OVERRIDES`."""
+    """The configuration of `python recipes/online_mujoco.py OVERRIDES`, of ACA without others."""
     with hydra.initialize_config_dir(str(CONFIGS), version_base="1.3"):
-        return configured(hydra.compose("online_mujoco", ["algo=aca", *overrides]))
+        return configured(hydra.compose("online_mujoco", list(overrides)))
 
 
 def make_recipe_agent(cfg: RunConfig, env: EnvBase) -> Agent:

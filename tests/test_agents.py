@@ -211,3 +211,39 @@ def test_the_entropy_target_is_meant_for_actions_between_minus_one_and_one(algo)
     # TorchRL's loss measures in env units, ours in [-1, 1]: their targets differ by the Jacobian.
     jacobian = {"sac": 17 * torch.tensor(0.4).log().item(), "rlpd": 0.0}[algo]
     assert float(target) == pytest.approx(-17 * scale + jacobian, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("algo", "variant", "last"),
+    [
+        ("qsm", [], 3e-5),
+        ("sdac", [], 3e-5),
+        ("qvpo", [], 3e-5),
+        ("qvpo", ["variant=qvpo_sdac_repo"], 5e-5),
+    ],
+)
+def test_the_learning_rate_of_a_diffusion_policy_decays_in_its_own_steps(algo, variant, last):
+    agent = built(algo, *variant)
+    scheduler, optimizer = agent.state["scheduler"], agent.state["actor_optimizer"]
+    factor = scheduler.lr_lambdas[0]
+    rates = [3e-4 * factor(step) for step in (0, 25_000, 50_000, 75_000, 10**6)]
+    assert rates == pytest.approx([3e-4, 3e-4, (3e-4 + last) / 2, last, last])
+    update(agent, range(4))
+    steps = 4 if algo == "qsm" else 2  # at every update, at every second
+    assert scheduler.last_epoch == steps
+    assert optimizer.state[optimizer.param_groups[0]["params"][0]]["step"] == steps
+
+
+@pytest.mark.parametrize(("variant", "first"), [("qvpo", 0.02), ("qvpo_sdac_repo", 1.6094379)])
+def test_the_weight_of_qvpos_uniform_actions_follows_its_updates(variant, first):
+    settings = configured(composed("algo=qvpo", f"variant={variant}")).qvpo
+    updates = (0, 1, 50_000, 100_000, 180_000)
+    expected = [first, 0.02, 0.015, 0.01, 0.002]
+    assert [settings.coefficient(update) for update in updates] == pytest.approx(expected, abs=2e-7)
+    agent = built("qvpo", f"variant={variant}", "qvpo.entropy_updates=4")
+    seen = []
+    for number in range(5):
+        update(agent, [number])
+        seen.append(agent.state["loss"].entropy_coefficient.item())
+    # The policy learns at even updates, with the coefficient of its update.
+    assert seen == pytest.approx([first, first, 0.01, 0.01, 0.002])

@@ -96,6 +96,23 @@ RIVALS = [
     ("algo=rlpd", "rlpd.init=zeros", "rlpd.init='zeros': expected 'xavier_uniform' or"),
     ("algo=rlpd", "optim.actor_lr=0", "optim.actor_lr=0: expected greater than 0"),
     ("algo=rlpd", "rlpd.actor_interval=0.5", "rlpd.actor_interval=0.5: expected a valid integer"),
+    ("algo=qsm", "qsm.sampler=mala", "qsm.sampler='mala': expected 'langevin' or 'denoising'"),
+    ("algo=qsm", "qsm.score_scale=0", "qsm.score_scale=0: expected greater than 0"),
+    ("algo=qsm", "qsm.gradient_of=max", "qsm.gradient_of='max': expected 'min' or 'mean'"),
+    ("algo=qsm", "qsm.linear_scale=2", "qsm.linear_scale=2: expected less than or equal to 1"),
+    ("algo=qsm", "qsm.activation=Tanh", "qsm.activation='Tanh': expected 'Mish', 'ReLU' or 'GELU'"),
+    ("algo=qvpo", "qvpo.num_candidates=1", "num_candidates=1: expected at least 2, as one has no"),
+    ("algo=qvpo", "qvpo.weight=rank", "qvpo.weight='rank': expected 'advantage' or 'cutoff'"),
+    (
+        "algo=qvpo",
+        "qvpo.num_uniform=-1",
+        "qvpo.num_uniform=-1: expected greater than or equal to 0",
+    ),
+    ("algo=qvpo", "variant=qsm", "qvpo.weight is missing from the configuration"),
+    ("algo=sdac", "sdac.num_proposals=0", "sdac.num_proposals=0: expected greater than or equal"),
+    ("algo=sdac", "sdac.initial_scale=0", "sdac.initial_scale=0: expected greater than 0"),
+    ("algo=sdac", "sdac.actor_interval=0", "sdac.actor_interval=0: expected greater than or equal"),
+    ("algo=sdac", "optim.lr_decay_end=10", r"expected at least optim.lr_decay_start \(25000"),
     ("algo=sac", "sac.activation=Foo", "sac.activation='Foo': expected the name of an activation"),
     ("algo=sac", "sac.activation=functional", "sac.activation='functional'"),
     ("algo=sac", "sac.num_cells=[0]", "sac.num_cells.0=0"),
@@ -145,8 +162,13 @@ def test_every_configuration_is_a_valid_one():
         for algo in AGENTS:
             cfg = configured(composed(f"env={env}", f"algo={algo}"))
             assert cfg.algo.name == algo and isinstance(cfg, RunConfig)
-    for name in ("quickstart", "dataset_sac"):
-        configured(composed(name=name))
+    configured(composed(name="dataset_sac"))
+    for algo in AGENTS:
+        assert configured(composed(f"algo={algo}", name="quickstart")).optim.total_updates == 3000
+    for variant in ("qsm_authors", "qvpo_sdac_repo"):
+        algo = variant.partition("_")[0]
+        cfg = configured(composed(f"algo={algo}", f"variant={variant}"))
+        assert cfg.variant.name == variant
     for algo in ("aca", "rlpd"):
         cfg = composed(f"algo={algo}", name="o2o_quickstart")
         assert configured(cfg, OfflineToOnlineConfig).optim.total_updates == 3000

@@ -22,6 +22,22 @@ PAIRS = {
 }
 
 
+# What is left of the signal, alpha_bar, at levels of the schedules that the rivals' codes have.
+REMAINING = [
+    (NoiseSchedule.linear(20, 1e-4, 0.999, 0.8), {1: 0.99992, 20: 5.27e-6}),
+    (NoiseSchedule.linear(20, 1e-4, 0.999, 0.3), {1: 0.99997, 20: 0.0346}),
+    (NoiseSchedule.linear(100, 1e-4, 0.999, 0.3), {100: 5.2e-8}),
+    (NoiseSchedule.cosine(20), {1: 0.992007, 20: 6.06e-6}),
+    (NoiseSchedule.vp(20), {20: 0.00641}),
+]
+
+
+@pytest.mark.parametrize(("schedule", "expected"), REMAINING)
+def test_what_the_schedules_of_the_rivals_leave_of_the_signal(schedule, expected):
+    for level, value in expected.items():
+        assert schedule.alphas_cumprod[level - 1].item() == pytest.approx(value, rel=5e-3)
+
+
 @pytest.fixture(params=PAIRS)
 def pair(request):
     make, betas = PAIRS[request.param]
