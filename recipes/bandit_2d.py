@@ -192,7 +192,8 @@ def study(cfg: BanditConfig, run_dir: Path) -> None:
         actors.setdefault(method, pickle.loads(actor))
     table = tables.summary(reported)
     for name, rows in (("seeds", reported), ("sweep", swept), ("table", table)):
-        tables.write_csv(run_dir / f"{name}.csv", rows)
+        if rows:
+            tables.write_csv(run_dir / f"{name}.csv", rows)
     print(tables.as_text(table))
     if cfg.figures:
         draw_figures(run_dir, actors, reported, swept)
