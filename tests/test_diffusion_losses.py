@@ -351,6 +351,19 @@ def test_one_candidate_and_one_action_dimension(name):
     assert all(value.isfinite() for value in loss(data).values())
 
 
+@pytest.mark.parametrize("name", MAKE)
+def test_an_update_reads_no_value_and_stays_on_its_device(name):
+    """As a CUDA graph asks: on the device `meta`, which has no values, both would raise."""
+    exploration = {"exploration_noise": 0.1} if name == "sdac" else {}
+    policy = make_diffusion_policy(chain=LANGEVIN if name == "qsm" else None, **exploration)
+    loss = {"qsm": QSMLoss, "sdac": SDACLoss, "qvpo": QVPOLoss}[name](policy.to("meta"))
+    data = make_rlpd_data(BATCH).to("meta")
+    out = loss(data)
+    sum(value for key, value in out.items() if key.startswith("loss")).backward()
+    devices = {param.grad.device.type for param in loss.parameters()}
+    assert devices == {"meta"} == {data["td_error"].device.type}
+
+
 def test_what_a_loss_cannot_work_with_is_told():
     policy = make_diffusion_policy()
     with pytest.raises(ValueError, match="num_candidates >= 2, got 1"):

@@ -11,21 +11,10 @@ from tensordict import TensorDict
 
 from agents import configured, make_agent
 from online_mujoco import train
-from recipe_cases import composed
+from recipe_cases import TINY, composed
 from torchrl_aca.errors import RunError
 from torchrl_aca.training.acceleration import capture, compiled, make_adam
 from torchrl_aca.training.envs import make_vector_env
-
-TINY = [
-    "env=inverted_pendulum",
-    "num_threads=1",
-    "aca.num_cells=[16,16]",
-    "aca.num_steps=3",
-    "aca.num_candidates=2",
-    "aca.num_target_candidates=2",
-    "aca.alpha_interval=2",
-]
-
 
 without_cuda = pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU captures these steps")
 
@@ -47,9 +36,13 @@ def batch_of(seed: int, size: int = 16) -> TensorDict:
     )
 
 
-def updated(*overrides: str, updates: int = 5):
-    """The metrics of a fresh ACA agent's first updates, and its state afterwards."""
-    cfg = configured(composed(*TINY, *overrides))
+# With a chain, and with it steps that are captured or compiled apart from the losses.
+CHAINS = ["aca", "qsm", "qvpo", "sdac"]
+
+
+def updated(algo: str, *overrides: str, updates: int = 5):
+    """The metrics of a fresh agent's first updates, and its state afterwards."""
+    cfg = configured(composed(*TINY[algo], "env=inverted_pendulum", *overrides))
     env = make_vector_env(cfg.env.name, 1, 0)
     torch.manual_seed(0)
     agent = make_agent(cfg, env, torch.device("cpu"))
@@ -76,11 +69,12 @@ def test_without_cuda_a_captured_step_runs_as_it_is():
 
 
 @without_cuda
-def test_cudagraphs_on_a_cpu_change_no_update():
-    plain, plain_state = updated()
+@pytest.mark.parametrize("algo", CHAINS)
+def test_cudagraphs_on_a_cpu_change_no_update(algo):
+    plain, plain_state = updated(algo)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        captured, captured_state = updated("cudagraphs=true")
+        captured, captured_state = updated(algo, "cudagraphs=true")
     assert [sorted(each) for each in plain] == [sorted(each) for each in captured]
     for one, two in zip(plain, captured, strict=True):
         assert all(torch.equal(one[name], two[name]) for name in one)
@@ -89,19 +83,20 @@ def test_cudagraphs_on_a_cpu_change_no_update():
 
 
 def test_the_recipe_refuses_cudagraphs_on_a_cpu(tmp_path):
-    cfg = composed(*TINY, "cudagraphs=true", f"run_dir={tmp_path / 'here'}")
+    cfg = composed(*TINY["aca"], "cudagraphs=true", f"run_dir={tmp_path / 'here'}")
     with pytest.raises(RunError, match="cudagraphs=true: expected device=cuda, got cpu"):
         train(cfg)
     assert not (tmp_path / "here").exists()
 
 
 @pytest.mark.slow
-def test_compiled_losses_are_those_of_plain_ones(tmp_path, monkeypatch):
+@pytest.mark.parametrize("algo", CHAINS)
+def test_compiled_losses_are_those_of_plain_ones(algo, tmp_path, monkeypatch):
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))
-    plain, _ = updated(updates=3)
+    plain, _ = updated(algo, updates=3)
     # Compiled code has random numbers of its own, unless it is told to draw torch's.
     with torch._inductor.config.patch(fallback_random=True):
-        quick, _ = updated("compile=true", updates=3)
+        quick, _ = updated(algo, "compile=true", updates=3)
     for one, two in zip(plain, quick, strict=True):
         assert one.keys() == two.keys()
         for name in one:

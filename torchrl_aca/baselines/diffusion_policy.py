@@ -95,6 +95,7 @@ class DiffusionPolicy(TensorDictModuleBase):
     center: Tensor
     half_range: Tensor
     fixed_noise: Tensor
+    step_sizes: Tensor | None
     network: Any
     critic: Any
     schedule: Any
@@ -130,15 +131,16 @@ class DiffusionPolicy(TensorDictModuleBase):
         check_choice(("fixed", "fresh"), deterministic_draws=deterministic_draws)
         anchor = first_parameter(network)
         self.network, self.critic = network, critic
-        self.schedule, self.step_sizes = None, None
+        step_sizes = None
         if isinstance(schedule, NoiseSchedule):
             # A copy: `to` works in place, and the schedule may serve policies elsewhere too.
             self.schedule = copy.deepcopy(schedule).to(anchor.device)
             self.num_steps = schedule.num_steps
         else:
-            self.step_sizes = [float(size) for size in schedule]
-            self.num_steps = len(self.step_sizes)
-            check_above(0, least_step_size=min(self.step_sizes, default=0.0))
+            self.schedule, self.num_steps = None, len(schedule)
+            step_sizes = torch.tensor(schedule, dtype=torch.float64, device=anchor.device)
+            check_above(0, least_step_size=min(schedule, default=0.0))
+        self.register_buffer("step_sizes", step_sizes, persistent=False)
         _check_fit(network, critic, self.num_steps, num_candidates)
         self.num_candidates = num_candidates
         self.initial_scale = initial_scale
