@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from torchrl.objectives import SoftUpdate
 
 import oracle
 import oracle_diffusion as numpy_of
@@ -17,7 +18,8 @@ from loss_cases import (
     make_rlpd_data,
 )
 from test_diffusion_losses import BATCH, EXACT, GAMMA, array, critics_of, make_data, unit
-from torchrl_aca.baselines import DACERLoss
+from torchrl_aca import NoiseSchedule
+from torchrl_aca.baselines import DACERLoss, DiffusionPolicy, NoiseNetwork, TwinCritic
 from torchrl_aca.baselines.dacer import distributional_error, running_scale
 from torchrl_aca.baselines.gmm import fit_gmm, gmm_entropy
 
@@ -276,6 +278,37 @@ def test_more_noise_more_entropy():
         torch.manual_seed(0)
         entropies.append(loss.entropy(data).mean().item())
     assert entropies == sorted(entropies)
+
+
+# --- corners --------------------------------------------------------------------------------------
+
+
+def test_one_action_dimension_and_equal_critics():
+    policy = DiffusionPolicy(
+        NoiseNetwork(3, 1, num_steps=NUM_STEPS, num_cells=(6,)),
+        NoiseSchedule.vp(NUM_STEPS),
+        critic=TwinCritic(3, 1, num_outputs=2, num_cells=(6,)),
+        exploration_noise=0.1,
+        clip_action=True,
+    )
+    for param in policy.critic.parameters():
+        param.data[1] = param.data[0]
+    loss = DACERLoss(policy)
+    SoftUpdate(loss, tau=0.1)
+    data = make_rlpd_data(BATCH)
+    data = data.apply(lambda x: x.float() if x.is_floating_point() else x)
+    data["action"] = data["action"][:, :1].clamp(-1, 1)
+    assert all(value.isfinite() for value in loss(data).values())
+
+
+def test_an_update_reads_no_value_and_stays_on_its_device():
+    """As a CUDA graph asks: on the device `meta`, which has no values, both would raise."""
+    loss = DACERLoss(make_dacer().actor_network.to("meta"))
+    data = make_rlpd_data(BATCH).to("meta")
+    for name in ("qvalue", "actor", "alpha"):
+        getattr(loss, f"{name}_loss")(data)[f"loss_{name}"].backward()
+    loss.step_scale()
+    assert {param.grad.device.type for param in loss.parameters()} == {"meta"}
 
 
 # --- mistakes -------------------------------------------------------------------------------------

@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from torchrl.objectives import SoftUpdate
 
 import oracle
 import oracle_diffusion as numpy_of
 from agents.dipo import cut_gradients
-from loss_cases import HIGH, LOW, make_dipo, make_dipo_data
+from loss_cases import HIGH, LOW, NUM_STEPS, make_dipo, make_dipo_data
 from o2o_halfcheetah import train as train_with_data
 from online_mujoco import train
 from recipe_cases import TINY, batch_of, composed
@@ -24,7 +25,8 @@ from test_diffusion_losses import (
     noised,
     unit,
 )
-from torchrl_aca.baselines import DIPOLoss
+from torchrl_aca import NoiseSchedule
+from torchrl_aca.baselines import DiffusionPolicy, DIPOLoss, NoiseNetwork, TwinCritic
 from torchrl_aca.baselines.dipo import improve_actions
 from torchrl_aca.chain import StepRunner
 from torchrl_aca.errors import RunError
@@ -195,6 +197,35 @@ def test_the_target_is_of_the_policys_moving_average():
 def test_settings_out_of_range_are_refused(kwargs, message):
     with pytest.raises(ValueError, match=message):
         DIPOLoss(make_dipo().actor_network, **kwargs)
+
+
+def test_one_action_dimension_and_equal_critics():
+    policy = DiffusionPolicy(
+        NoiseNetwork(3, 1, num_steps=NUM_STEPS, num_cells=(6,), embedding="sinusoidal"),
+        NoiseSchedule.cosine(NUM_STEPS),
+        critic=TwinCritic(3, 1, num_cells=(6,)),
+    )
+    for param in policy.critic.parameters():
+        param.data[1] = param.data[0]
+    loss = DIPOLoss(policy)
+    SoftUpdate(loss, tau=0.1)
+    data = make_dipo_data(BATCH)
+    data = data.apply(lambda x: x.float() if x.is_floating_point() else x)
+    for key in ("action", "best_action"):
+        data[key] = data[key][:, :1].clamp(-1, 1)
+    assert all(value.isfinite() for value in loss(data).values())
+    assert loss.improve(data).isfinite().all()
+
+
+def test_an_update_reads_no_value_and_stays_on_its_device():
+    """As a CUDA graph asks: on the device `meta`, which has no values, both would raise."""
+    loss = DIPOLoss(make_dipo().actor_network.to("meta"))
+    data = make_dipo_data(BATCH).to("meta")
+    data["best_action"] = loss.improve(data)
+    for name in ("qvalue", "actor"):
+        getattr(loss, f"{name}_loss")(data)[f"loss_{name}"].backward()
+    devices = {param.grad.device.type for param in loss.parameters() if param.requires_grad}
+    assert devices == {"meta"} == {data["best_action"].device.type}
 
 
 # --- the agent ------------------------------------------------------------------------------------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Annotated, Any
 
 import torch
@@ -12,7 +11,7 @@ from torchrl.envs import EnvBase
 
 from agents.diffusion import DiffusionOptim, DiffusionSettings, make_policy, make_steps
 from torchrl_aca.baselines import DACERLoss
-from torchrl_aca.training.acceleration import capture, descend, make_adam
+from torchrl_aca.training.acceleration import descend, make_adam
 from torchrl_aca.training.agent import Agent
 from torchrl_aca.training.config import Count, NonNegative, Positive
 
@@ -73,7 +72,7 @@ def make_dacer(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
     steps = make_steps(cfg, loss)
     alpha_optimizer = make_adam([loss.log_alpha], cfg.optim.alpha_lr, cfg.cudagraphs)
 
-    @partial(capture, enabled=cfg.cudagraphs)
+    # So rare that a graph of it would not pay.
     def alpha_step(batch: TensorDictBase) -> TensorDictBase:
         return descend(loss.alpha_loss(batch), "loss_alpha", alpha_optimizer)
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
 from agents.diffusion import DiffusionOptim, DiffusionSettings, make_policy, make_steps
 from torchrl_aca.baselines import DIPOLoss
+from torchrl_aca.training.acceleration import capture
 from torchrl_aca.training.agent import Agent
 from torchrl_aca.training.config import Count, Positive
 
@@ -58,6 +60,10 @@ def make_dipo(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
     cut_gradients(steps.state["optimizer"], max_norm, stacked=True)
     cut_gradients(steps.state["actor_optimizer"], max_norm, stacked=False)
 
+    @partial(capture, enabled=cfg.cudagraphs)
+    def improve(batch: TensorDictBase) -> TensorDictBase:
+        return TensorDict({best_action: loss.improve(batch)}, batch_size=batch.batch_size)
+
     def move(name: str) -> None:
         """Moves the targets of one network, which SoftUpdate would do for both."""
         source = getattr(loss, f"{name}_params").data
@@ -66,7 +72,7 @@ def make_dipo(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
     def update(batch: TensorDictBase) -> TensorDictBase:
         updates = steps.progress.updates
         metrics = steps.critics(batch)
-        batch[best_action] = loss.improve(batch)
+        batch.update(improve(batch))
         if updates % settings.actor_interval == 0:
             metrics.update(steps.actor(batch))
         if updates % settings.target_interval == 0:

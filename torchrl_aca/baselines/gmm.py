@@ -86,7 +86,7 @@ def gmm_entropy(mixture: GaussianMixture) -> Tensor:
 def responsibilities(samples: Tensor, mixture: GaussianMixture) -> Tensor:
     """``p(k | sample)`` under the mixture, shape ``(*batch, n, K)``."""
     weights, means, covariances = mixture
-    factor = torch.linalg.cholesky(covariances)
+    factor = torch.linalg.cholesky_ex(covariances).L  # reads no value, as a check would
     offsets = (samples.unsqueeze(-3) - means.unsqueeze(-2)).mT  # (*batch, K, A, n)
     scaled = torch.linalg.solve_triangular(factor, offsets, upper=False)
     log_det = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
