@@ -1,15 +1,18 @@
-"""The paper's 2D bandit study: three ways to draw actions from a critic, on eight modes.
+"""The paper's 2D bandit study: ways to draw actions from a critic or a policy, on eight modes.
 
     python recipes/bandit_2d.py
+    python recipes/bandit_2d.py methods=all
     python recipes/bandit_2d.py data=uniform seeds=[0]
     python recipes/bandit_2d.py --config-name bandit_2d_ablation
 
 - aca (Diffusion-Q_t): denoising, guided by a critic that knows the noise level;
 - diffusion_q: the same chain, guided by a plain critic Q(s, a);
-- langevin_q: Langevin steps along the plain critic's gradient.
+- langevin_q: Langevin steps along the plain critic's gradient;
+- sdac, qsm, dacer, dipo: diffusion policies that learn from the plain critic (bandit/rivals.py).
 
-Actions are in the modes' own units, in which a_T ~ N(0, I) lies about their circle: the actor gets
-no spec, so that nothing is scaled. N = 1 and no exploration noise: what counts is the chain alone.
+Actions are in the modes' own units, in which a_T ~ N(0, I) lies about their circle: the actors get
+no spec, so that nothing is scaled. N = 1, and no exploration noise in what is measured: what counts
+is the chain alone.
 """
 
 from __future__ import annotations
@@ -26,17 +29,20 @@ from pathlib import Path
 import hydra
 import torch
 from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDict
 from torchrl import logger as torchrl_logger
 from torchrl.collectors import Collector
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MLP, ValueOperator
 from tqdm import tqdm
 
-from bandit import tables
-from bandit.config import BanditConfig, variants
+from bandit import rivals, tables
+from bandit.config import RIVALS, BanditConfig, variants
 from bandit.env import TwoDBandit, mode_shares, reward
 from bandit.figures import draw_figures
 from bandit.tables import Row
-from torchrl_aca import ACALoss, CriticGuidedDenoisingActor, NoiseLevelCritic, NoiseSchedule
+from torchrl_aca import ACALoss, CriticGuidedDenoisingActor, NoiseLevelCritic
+from torchrl_aca.baselines import DiffusionPolicy
 from torchrl_aca.errors import RunError
 from torchrl_aca.replay import make_replay_buffer, transitions
 from torchrl_aca.training.config import checked
@@ -45,6 +51,7 @@ from torchrl_aca.training.report import versions
 from torchrl_aca.training.run_dir import make_run_dir
 
 Task = tuple[BanditConfig, str, int]  # settings, method, training seed
+Actor = CriticGuidedDenoisingActor | DiffusionPolicy
 
 
 def make_actor(cfg: BanditConfig, method: str) -> CriticGuidedDenoisingActor:
@@ -59,10 +66,9 @@ def make_actor(cfg: BanditConfig, method: str) -> CriticGuidedDenoisingActor:
             MLP(3, cfg.critic.num_critics, num_cells=num_cells, activation_class=torch.nn.Mish),
             in_keys=["observation", "action"],
         )
-    settings = chain.linear.model_dump() if chain.schedule == "linear" else {}
     return CriticGuidedDenoisingActor(
         critic,
-        getattr(NoiseSchedule, chain.schedule)(chain.num_steps, **settings),
+        chain.make_schedule(chain.schedule),
         action_dim=2,
         guidance_weight=cfg.collector.guidance_weight[method],
         num_candidates=1,
@@ -71,6 +77,7 @@ def make_actor(cfg: BanditConfig, method: str) -> CriticGuidedDenoisingActor:
         sampler="langevin" if method == "langevin_q" else "denoising",
         langevin_step_size=chain.langevin_step_size,
         exploration_noise=0.0,
+        deterministic_draws="fresh",
     )
 
 
@@ -109,9 +116,12 @@ def train(cfg: BanditConfig, method: str, seed: int) -> CriticGuidedDenoisingAct
     return actor
 
 
-def draw(actor: CriticGuidedDenoisingActor, num_samples: int) -> torch.Tensor:
-    """Samples of shape (num_samples, 2), in the mode of acting."""
-    return actor.sample(torch.zeros(num_samples, 1), [num_samples])
+@torch.no_grad()
+def draw(actor: Actor, num_samples: int) -> torch.Tensor:
+    """Samples of shape (num_samples, 2), from fresh chains without exploration noise."""
+    states = TensorDict({"observation": torch.zeros(num_samples, 1)}, batch_size=[num_samples])
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        return actor(states)["action"]
 
 
 def measure(actions: torch.Tensor) -> Row:
@@ -136,6 +146,8 @@ def run(task: Task) -> tuple[list[Row], list[Row], bytes]:
     cfg, method, seed = task
     torch.set_num_threads(cfg.num_threads)
     torchrl_logger.setLevel("WARNING")  # its notes about storages would break the progress bar
+    if method in RIVALS:
+        return run_rival(cfg, method, seed)
     actor = train(cfg, method, seed)
     reported, swept = [], []
     for changed in cfg.ablation.samplings():
@@ -146,6 +158,14 @@ def run(task: Task) -> tuple[list[Row], list[Row], bytes]:
         fresh = measure(draw(actor, cfg.report.num_samples))
         reported.append({**label, "weight": float(actor.guidance_weight), **fresh})
     return reported, swept, pickle.dumps(actor)
+
+
+def run_rival(cfg: BanditConfig, method: str, seed: int) -> tuple[list[Row], list[Row], bytes]:
+    """As `run`; the rewards choose a setting of a rival's training, so there is no sweep."""
+    actor = rivals.train(cfg, method, seed)
+    chosen = next(iter(cfg.rivals[method].chosen.values()), None)
+    row = {"method": method, "seed": seed, "weight": chosen}
+    return [{**row, **measure(draw(actor, cfg.report.num_samples))}], [], pickle.dumps(actor)
 
 
 def run_all(
@@ -172,7 +192,8 @@ def study(cfg: BanditConfig, run_dir: Path) -> None:
         actors.setdefault(method, pickle.loads(actor))
     table = tables.summary(reported)
     for name, rows in (("seeds", reported), ("sweep", swept), ("table", table)):
-        tables.write_csv(run_dir / f"{name}.csv", rows)
+        if rows:
+            tables.write_csv(run_dir / f"{name}.csv", rows)
     print(tables.as_text(table))
     if cfg.figures:
         draw_figures(run_dir, actors, reported, swept)

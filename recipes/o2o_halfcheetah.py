@@ -23,7 +23,7 @@ from omegaconf import DictConfig
 from pydantic import Field, model_validator
 
 import renderer  # noqa: F401
-from agents import configured, make_agent
+from agents import AGENTS, configured, make_agent
 from agents.pretrained import require_offline_phase, start_from
 from data.offline import (
     generate_missing,
@@ -53,6 +53,13 @@ class OfflineToOnlineConfig(RunConfig):
     offline_fraction: Share
     utd: Annotated[float, Field(ge=1e-4, le=1e4)]
     online_frames: Count
+
+    @model_validator(mode="after")
+    def _method(self) -> OfflineToOnlineConfig:
+        if not AGENTS[self.algo.name].mixes:
+            able = sorted(name for name, method in AGENTS.items() if method.mixes)
+            self.refuse("algo.name", f"one of {able}, as it changes the rows of its buffer")
+        return self
 
     @model_validator(mode="before")
     @classmethod

@@ -23,7 +23,9 @@ from torchrl.objectives import SoftUpdate
 from torchrl_aca import ACALoss, CriticGuidedDenoisingActor, NoiseLevelCritic, NoiseSchedule
 from torchrl_aca.baselines import (
     CalQLLoss,
+    DACERLoss,
     DiffusionPolicy,
+    DIPOLoss,
     EnsembleCQLLoss,
     EnsembleIQLLoss,
     EnsembleMLP,
@@ -226,6 +228,31 @@ def make_sdac(state="observation", action="action", policy=None, **kwargs):
     return make_diffusion_loss(SDACLoss, policy=policy, **{"num_proposals": 5, **kwargs})
 
 
+def make_dipo(state="observation", action="action", policy=None, **kwargs):
+    if policy is None:
+        policy = make_diffusion_policy(state, action, num_candidates=1)
+    return make_diffusion_loss(DIPOLoss, policy=policy, **{"num_gradient_steps": 4, **kwargs})
+
+
+def make_dipo_data(*batch):
+    data = make_rlpd_data(*batch)
+    unit = torch.rand_like(data["action"])
+    return data.set("best_action", LOW + unit * (HIGH - LOW))
+
+
+def make_dacer_critic(**kwargs):
+    sizes = {"num_cells": (6, 5), "dtype": torch.float64, **kwargs}
+    return TwinCritic(OBSERVATION_DIM, ACTION_DIM, num_outputs=2, **sizes)
+
+
+def make_dacer(state="observation", action="action", policy=None, **kwargs):
+    if policy is None:
+        noise = {"exploration_noise": 0.1, "alpha_init": 2.0, "clip_action": True}
+        critic = make_dacer_critic()
+        policy = make_diffusion_policy(state, action, critic, num_candidates=1, **noise)
+    return make_diffusion_loss(DACERLoss, policy=policy, **{"num_entropy_samples": 30, **kwargs})
+
+
 # --- CQL, Cal-QL, IQL -----------------------------------------------------------------------------
 
 
@@ -301,6 +328,22 @@ CASES = {
         frozenset(
             {"pred_value", "target_value", "noisy_value", "alpha", "entropy", "exploration_std"}
         ),
+        frozenset({"td_error"}),
+    ),
+    "dacer": LossCase(
+        make_dacer,
+        make_rlpd_data,
+        ("qvalue_loss", "actor_loss", "alpha_loss"),
+        frozenset(
+            {"pred_value", "target_value", "value_std", "alpha", "entropy", "exploration_std"}
+        ),
+        frozenset({"td_error"}),
+    ),
+    "dipo": LossCase(
+        make_dipo,
+        make_dipo_data,
+        ("qvalue_loss", "actor_loss"),
+        frozenset({"pred_value", "target_value", "improvement"}),
         frozenset({"td_error"}),
     ),
     "qsm": LossCase(

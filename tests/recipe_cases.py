@@ -41,6 +41,13 @@ TINY_SIZES = {
         "aca.num_target_candidates=2",
         "aca.alpha_interval=20",
     ],
+    "dacer": [
+        "dacer.num_cells=[16,16]",
+        "dacer.num_steps=3",
+        "dacer.num_entropy_samples=10",
+        "dacer.alpha_interval=20",
+    ],
+    "dipo": ["dipo.num_cells=[16,16]", "dipo.num_steps=4", "dipo.num_gradient_steps=5"],
     "qsm": [
         "qsm.num_cells=[16,16]",
         "qsm.num_steps=3",

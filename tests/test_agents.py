@@ -29,12 +29,16 @@ CPU = torch.device("cpu")
 EVERY = sorted(AGENTS)
 VARIANTS = [
     *((algo, []) for algo in EVERY),
+    ("dacer", ["variant=dacer_sdac_repo"]),
+    ("dipo", ["variant=dipo_sdac_repo"]),
     ("rlpd", ["variant=wsrl"]),
     ("qsm", ["variant=qsm_authors"]),
     ("qvpo", ["variant=qvpo_sdac_repo"]),
 ]
 HUMANOID_PARAMETERS = {
     "aca": 475_746,
+    "dacer": 707_909,
+    "dipo": 710_419,
     "qsm": 702_227,
     "qvpo": 707_395,
     "sac": 702_244,
@@ -48,6 +52,22 @@ BANDIT = {
         "aca.num_steps=20",
         "aca.num_candidates=32",
         "aca.reward_scale=1",
+    ],
+    # Little noise and a slow policy: what a wrong critic drives to the bounds stays there.
+    "dacer": [
+        "variant=dacer_sdac_repo",
+        "optim.lr=1e-2",
+        "optim.actor_lr=1e-3",
+        "dacer.num_cells=[64,64]",
+        "dacer.linear_scale=0.01",
+        "dacer.initial_scale=0.1",
+    ],
+    "dipo": [  # every batch is new, so an action has one update to become the best
+        "optim.lr=1e-2",
+        "optim.actor_lr=1e-2",
+        "dipo.num_cells=[64,64]",
+        "dipo.num_steps=20",
+        "dipo.num_gradient_steps=60",
     ],
     "qsm": [
         "optim.lr=1e-2",
@@ -162,6 +182,7 @@ def test_an_update_leaves_its_batch_as_it_is_and_gives_detached_numbers(algo):
     before = batch.clone()
     metrics = agent.update(batch)
     assert all(value.shape == () and not value.requires_grad for value in metrics.values())
+    assert set(batch.keys(True, True)) - set(before.keys(True, True)) == set(agent.rewrites)
     for key in before.keys(True, True):
         assert torch.equal(before[key], batch[key]), key
 

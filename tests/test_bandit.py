@@ -8,17 +8,22 @@ import re
 import numpy as np
 import pytest
 import torch
+from omegaconf import OmegaConf
 from torchrl.envs.utils import check_env_specs
 
 import bandit_2d
 import recipe_cases
+from bandit import rivals
 from bandit.config import BanditConfig, variants
 from bandit.env import TwoDBandit, mode_shares, reward
 from recipe_cases import rows_of
+from torchrl_aca.baselines import DIPOLoss
 from torchrl_aca.errors import RunError
 from torchrl_aca.training.config import checked
 
 METHODS = ("aca", "diffusion_q", "langevin_q")
+RIVALS = ("sdac", "qsm", "dacer", "dipo")
+PAPER_SUMS = ("0.993", "0.636", "0.570", "0.927", "0.465", "1.000", "0.401")
 HIGH = np.sqrt(2) * np.array([[0, 1], [1, 0], [0, -1], [-1, 0]])  # top, right, bottom, left
 SMALL = [
     "critic.num_cells=[64,64,64]",
@@ -40,6 +45,8 @@ TINY = [
     "sweep.weights=[10,40]",
     "sweep.num_samples=50",
     "report.num_samples=50",
+    *(f"rivals.{name}.updates_per_batch=2" for name in RIVALS),
+    *(f"rivals.{name}.num_cells=[8]" for name in RIVALS),
 ]
 
 
@@ -108,6 +115,42 @@ def test_aca_finds_all_high_modes_with_more_samples_than_the_plain_critic():
     assert noisy["sum"] > plain["sum"] + 0.05
 
 
+@pytest.mark.slow
+def test_dacer_ends_in_one_mode_and_qsm_in_all_four():
+    one, four = (
+        bandit_2d.run((composed("methods=all"), name, 0))[0][0] for name in ("dacer", "qsm")
+    )
+    assert max(one[name] for name in ("top", "right", "bottom", "left")) > 0.95
+    assert min(four[name] for name in ("top", "right", "bottom", "left")) > 0.1
+
+
+@pytest.mark.parametrize("method", RIVALS)
+def test_rivals_measure_chains_without_exploration_noise(method):
+    """Noise so large that none of it can be in what is measured."""
+    cfg = composed(*TINY, "methods=all", f"rivals.{method}.exploration_noise=100")
+    actor = rivals.train(cfg, method, 0)
+    assert bandit_2d.draw(actor, 50).abs().max() <= 2
+    noisy = actor.sample(torch.zeros(50, 1))
+    assert noisy.abs().max() > 10
+
+
+def test_dipo_keeps_its_best_actions_in_the_box_of_the_random_ones(monkeypatch):
+    seen = []
+    improve = DIPOLoss.improve
+    monkeypatch.setattr(
+        DIPOLoss, "improve", lambda self, data: seen.append(improve(self, data)) or seen[-1]
+    )
+    rivals.train(composed(*TINY, "rivals.dipo.loss.num_gradient_steps=40"), "dipo", 0)
+    assert 1.2 < torch.cat(seen).abs().max() <= 2
+
+
+def test_settings_of_a_rival_that_is_left_out_are_asked_for():
+    settings = OmegaConf.to_container(recipe_cases.composed("methods=all", name="bandit_2d"))
+    del settings["rivals"]["qsm"]
+    with pytest.raises(RunError, match="expected settings of .'qsm'. as well"):
+        checked(BanditConfig, settings)
+
+
 def test_weight_is_chosen_by_reward_alone(monkeypatch):
     measured = iter([{"sum": 0.9, "reward_mean": 0.1}, {"sum": 0.1, "reward_mean": 0.9}])
     monkeypatch.setattr(bandit_2d, "measure", lambda actions: next(measured))
@@ -129,18 +172,34 @@ def test_data_comes_from_the_box_or_from_the_method_as_well(data, monkeypatch):
     assert outside == [False, data == "online"]
 
 
-def test_command_writes_all_its_files(tmp_path):
-    code, output, errors = recipe_cases.run(*TINY, "run_dir=run", cwd=tmp_path, recipe="bandit_2d")
+TABLES = {"table.csv", "seeds.csv", "sweep.csv", "config.yaml", "card.md"}
+GUIDED_FIGURES = {"reward.png", "samples.png", "sensitivity.png", "value_maps.png", "steps.gif"}
+RIVAL_FIGURES = {"samples_rivals.png", "steps_rivals.gif"}
+
+
+@pytest.mark.parametrize(
+    ("typed", "methods", "figures"),
+    [
+        ([], METHODS, GUIDED_FIGURES),
+        (["methods=all"], METHODS + RIVALS, GUIDED_FIGURES | RIVAL_FIGURES),
+        (["methods=[qsm,dacer]"], ("qsm", "dacer"), RIVAL_FIGURES | {"reward.png"}),
+    ],
+    ids=["default", "all", "rivals"],
+)
+def test_command_writes_all_its_files(typed, methods, figures, tmp_path):
+    typed = [*TINY, *typed, "run_dir=run"]
+    code, output, errors = recipe_cases.run(*typed, cwd=tmp_path, recipe="bandit_2d")
     assert code == 0, errors
-    figures = {"reward.png", "samples.png", "sensitivity.png", "value_maps.png", "steps.gif"}
-    figures |= {f"steps_{method}.png" for method in METHODS}
-    tables = {"table.csv", "seeds.csv", "sweep.csv", "config.yaml", "card.md"}
-    assert {path.name for path in (tmp_path / "run").iterdir()} == figures | tables
+    steps = {f"steps_{method}.png" for method in methods}
+    written = {path.name for path in (tmp_path / "run").iterdir()}
+    assert written == figures | steps | TABLES - (set() if "aca" in methods else {"sweep.csv"})
     table = rows_of(tmp_path / "run" / "table.csv")
-    assert [row["source"] for row in table] == ["here, 1 seeds", "paper"] * 3
-    assert [row["sum"] for row in table[1::2]] == ["0.993", "0.636", "0.570"]
-    assert len(rows_of(tmp_path / "run" / "sweep.csv")) == 2 * len(METHODS)
-    assert "ACA" in output and "3/3" in errors
+    assert [row["source"] for row in table] == ["here, 1 seeds", "paper"] * len(methods)
+    sums = dict(zip(METHODS + RIVALS, PAPER_SUMS, strict=True))
+    assert [row["sum"] for row in table[1::2]] == [sums[method] for method in methods]
+    if "aca" in methods:
+        assert len(rows_of(tmp_path / "run" / "sweep.csv")) == 2 * len(METHODS)
+    assert table[0]["method"] in output and f"{len(methods)}/{len(methods)}" in errors
 
 
 def test_ablation_has_a_row_for_each_combination(tmp_path):
@@ -186,7 +245,11 @@ def test_studies_of_the_same_second_never_share_a_directory(tmp_path, monkeypatc
     [
         ("data=offline", "data='offline': expected 'online' or 'uniform'"),
         ("chain.schedule=quadratic", "chain.schedule='quadratic': expected 'linear', 'cosine' or"),
-        ("methods=[sac]", "methods.0='sac': expected 'aca', 'diffusion_q' or 'langevin_q'"),
+        ("methods=[sac]", "methods.0='sac': expected 'aca', 'diffusion_q', 'langevin_q', 'sdac'"),
+        ("methods=every", "methods='every': expected a valid list"),
+        ("rivals.qsm.lr=0", "rivals.qsm.lr=0: expected greater than 0"),
+        ("rivals.qsm.schedule=steep", "rivals.qsm.schedule='steep': expected 'linear', 'cosine'"),
+        ("+rivals.sdac.chosen.num_proposals=9", "rivals.sdac.chosen={'inverse_temperature': "),
         ("methods=[]", "methods=[]: expected"),
         ("seeds=[]", "seeds=[]: expected"),
         ("seeds=0", "seeds=0: expected a valid list"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 from hydra.errors import HydraException
+from omegaconf import OmegaConf
 
 from agents import AGENTS, configured
 from o2o_halfcheetah import OfflineToOnlineConfig
@@ -190,6 +191,16 @@ def test_every_configuration_is_a_valid_one():
     for algo in ("aca", "rlpd"):
         cfg = composed(f"algo={algo}", name="o2o_quickstart")
         assert configured(cfg, OfflineToOnlineConfig).optim.total_updates == 3000
+
+
+def test_the_quickstart_of_a_method_has_what_its_file_says():
+    files = sorted((CONFIGS / "quickstart").glob("*.yaml"))
+    assert {"aca", "qsm", "qvpo", "sdac"} <= {file.stem for file in files} <= set(AGENTS)
+    for file in files:
+        cfg = composed(f"algo={file.stem}", name="quickstart")
+        assert OmegaConf.merge(cfg, OmegaConf.load(file)) == cfg
+    chosen = composed("algo=qsm", "qsm.score_scale=3", name="quickstart")
+    assert chosen.qsm.score_scale == 3
 
 
 def test_updates_follow_from_the_online_frames_unless_they_are_given():

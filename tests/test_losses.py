@@ -24,6 +24,9 @@ from loss_cases import (
 )
 from torchrl_aca import ACALoss
 from torchrl_aca.baselines import (
+    DACERLoss,
+    DiffusionPolicyLoss,
+    DIPOLoss,
     EnsembleMLP,
     EnsembleSACLoss,
     QSMLoss,
@@ -73,6 +76,15 @@ def assert_tied(loss):
         actor = loss.actor_network
         assert actor.critic is network and actor.log_alpha is loss.log_alpha
         assert actor.guidance_weight is loss.guidance_weight
+    if isinstance(loss, DiffusionPolicyLoss):
+        actor, params = loss.actor_network, loss.policy_network_params
+        assert actor.critic is network and actor.network is loss.policy_network
+        assert {id(p) for p in actor.network.parameters()} == {id(p) for p in params.parameters()}
+        assert actor.log_alpha is getattr(loss, "log_alpha", actor.log_alpha)
+        if loss.average_policy:
+            average = {p.data_ptr() for p in loss.average_actor_network.network.parameters()}
+            targets = loss.target_policy_network_params.values(True, True)
+            assert average == {p.data_ptr() for p in targets}
 
 
 # --- what it reads and writes ---------------------------------------------------------------------
@@ -343,19 +355,36 @@ class ShiftedTwin(TwinCritic):
         self.register_buffer("shift", torch.zeros(2, dtype=torch.float64))
 
     def evaluate(self, features, action):
-        return super().evaluate(features, action) + self.shift
+        values = super().evaluate(features, action)
+        if self.num_outputs == 1:
+            return values + self.shift
+        return values + self.shift[:, None] * values.new_tensor([1.0, 0.0])  # of DACER the means
 
 
-DIFFUSION = {"qsm": QSMLoss, "qvpo": QVPOLoss, "sdac": SDACLoss}
+DIFFUSION = {
+    "dacer": DACERLoss,
+    "dipo": DIPOLoss,
+    "qsm": QSMLoss,
+    "qvpo": QVPOLoss,
+    "sdac": SDACLoss,
+}
 
 
 def make_shifted(name):
     if name == "aca":
         return ACALoss(make_actor(ShiftedCritic(), action_dim=ACTION_DIM))
     if name in DIFFUSION:
-        critic = ShiftedTwin(OBSERVATION_DIM, ACTION_DIM, num_cells=(6,), dtype=torch.float64)
+        critic = ShiftedTwin(
+            OBSERVATION_DIM,
+            ACTION_DIM,
+            num_outputs=2 if name == "dacer" else 1,
+            num_cells=(6,),
+            dtype=torch.float64,
+        )
         chain = LANGEVIN if name == "qsm" else None
-        return DIFFUSION[name](make_diffusion_policy(critic=critic, chain=chain), reward_scale=1.0)
+        num_candidates = 1 if name in ("dacer", "dipo") else 3
+        policy = make_diffusion_policy(critic=critic, chain=chain, num_candidates=num_candidates)
+        return DIFFUSION[name](policy, reward_scale=1.0)
     critics = ValueOperator(ShiftedEnsemble(), in_keys=["observation", "action"])
     return EnsembleSACLoss(make_policy(), critics)
 

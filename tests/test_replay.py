@@ -4,9 +4,18 @@ from __future__ import annotations
 
 import pytest
 import torch
+from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, ListStorage, ReplayBuffer, TensorDictReplayBuffer
 
 from recipe_cases import collected
-from torchrl_aca.replay import BufferState, make_replay_buffer, transitions
+from torchrl_aca.replay import (
+    BufferState,
+    MixedReplayBuffer,
+    make_replay_buffer,
+    require_index,
+    transitions,
+    write_back,
+)
 
 
 def test_transitions_are_flat_and_hold_only_what_learning_needs():
@@ -24,6 +33,53 @@ def test_a_method_keeps_keys_of_its_own():
     assert flat["loc"].shape == (6, 6) and ("next", "reward") in flat.keys(True)
     with pytest.raises(KeyError, match="mc_return"):
         transitions(data, ["mc_return"])
+
+
+def test_what_a_method_rewrites_begins_as_a_copy():
+    data = collected(num_envs=3, steps=2)
+    rows = transitions(data, rewritten={"best_action": "action"})
+    assert torch.equal(rows["best_action"], rows["action"])
+    rows["best_action"].zero_()
+    assert rows["action"].any() and data["action"].any()
+    assert "best_action" not in data
+
+
+@pytest.mark.parametrize("num_rows", [12, 20, 33])
+def test_rewritten_entries_reach_the_rows_that_were_sampled_and_no_others(num_rows):
+    buffer = make_replay_buffer(capacity=20, batch_size=8)
+    for _ in range(num_rows):
+        data = collected(num_envs=1)
+        buffer.extend(transitions(data, rewritten={"best_action": "action"}))
+    before = buffer[:].clone()
+    batch = buffer.sample()
+    batch["best_action"] = batch["best_action"] + 1
+    write_back(buffer, batch, ["best_action"])
+    after, changed = buffer[:], batch["index"].unique()
+    assert 1 < len(changed) < len(buffer)
+    expected = before["best_action"].index_add(0, changed, torch.ones(len(changed), 6))
+    assert torch.equal(after["best_action"], expected)
+    assert (after.exclude("best_action") == before.exclude("best_action")).all()
+    for index, action in zip(batch["index"], batch["best_action"], strict=True):
+        assert torch.equal(buffer[int(index)]["best_action"], action)
+
+
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        (lambda: ReplayBuffer(storage=LazyTensorStorage(5)), "ReplayBuffer"),
+        (lambda: TensorDictReplayBuffer(storage=ListStorage(5)), "TensorDictReplayBuffer"),
+        (
+            lambda: MixedReplayBuffer(
+                TensorDict(action=torch.zeros(3, 1), batch_size=[3]), make_replay_buffer(5, 2)
+            ),
+            "MixedReplayBuffer",
+        ),
+    ],
+    ids=["no index", "no tensors", "mixture"],
+)
+def test_a_buffer_whose_rows_cannot_be_rewritten_is_refused(make, name):
+    with pytest.raises(ValueError, match=f"the index of each row; got a {name}"):
+        require_index(make())
 
 
 @pytest.mark.parametrize("rows", [7, 20, 33])

@@ -248,3 +248,12 @@ def test_a_part_that_cannot_be_saved_is_told_before_training(tmp_path, monkeypat
     with pytest.raises(RunError, match="'agent.counter' cannot be saved .TypeError: no state"):
         train(tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+def test_rows_of_a_mixture_are_never_rewritten(tmp_path, monkeypatch):
+    agent = toy_agent()
+    agent.rewrites = {"better": "action"}
+    monkeypatch.setattr("test_run_phases.toy_agent", lambda: agent)
+    with pytest.raises(RunError, match="algo=toy rewrites rows.*got a MixedReplayBuffer"):
+        train(tmp_path / "run")
+    assert not (tmp_path / "run").exists()

@@ -37,7 +37,7 @@ def batch_of(seed: int, size: int = 16) -> TensorDict:
 
 
 # With a chain, and with it steps that are captured or compiled apart from the losses.
-CHAINS = ["aca", "qsm", "qvpo", "sdac"]
+CHAINS = ["aca", "dacer", "dipo", "qsm", "qvpo", "sdac"]
 
 
 def updated(algo: str, *overrides: str, updates: int = 5):

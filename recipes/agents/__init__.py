@@ -23,7 +23,9 @@ from agents.cql import (
     make_cql,
     make_wsrl,
 )
+from agents.dacer import DACEROptim, DACERSettings, make_dacer
 from agents.diffusion import DiffusionOptim
+from agents.dipo import DIPOOptim, DIPOSettings, make_dipo
 from agents.iql import IQLOptim, IQLSettings, make_iql
 from agents.qsm import QSMSettings, make_qsm
 from agents.qvpo import QVPOSettings, make_qvpo
@@ -46,15 +48,21 @@ class Method:
         make: Builds the agent from a typed configuration, an environment and a device.
         sections: The sections of a configuration that are the method's own, by name.
         starts_from: Other methods with the same offline phase, whose runs it can go on from.
+        mixes: Whether its minibatches may hold rows of a data set.
     """
 
     make: Callable[[Any, EnvBase, torch.device], Agent]
     sections: Mapping[str, type[Section]]
     starts_from: tuple[str, ...] = ()
+    mixes: bool = True
 
 
 AGENTS = {
     "aca": Method(make_aca, {"aca": ACASettings, "optim": ACAOptim}),
+    "dacer": Method(make_dacer, {"dacer": DACERSettings, "variant": Variant, "optim": DACEROptim}),
+    "dipo": Method(
+        make_dipo, {"dipo": DIPOSettings, "variant": Variant, "optim": DIPOOptim}, mixes=False
+    ),
     "qsm": Method(make_qsm, {"qsm": QSMSettings, "variant": Variant, "optim": DiffusionOptim}),
     "qvpo": Method(make_qvpo, {"qvpo": QVPOSettings, "variant": Variant, "optim": DiffusionOptim}),
     "rlpd": Method(make_rlpd, {"rlpd": RLPDSettings, "variant": Variant, "optim": RLPDOptim}),

@@ -12,6 +12,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from bandit.tables import METHODS, Row
+from torchrl_aca import NoiseSchedule
 from torchrl_aca.training.config import (
     Count,
     NonNegative,
@@ -23,7 +24,13 @@ from torchrl_aca.training.config import (
 )
 
 Method = Literal[tuple(METHODS)]
+GUIDED = ("aca", "diffusion_q", "langevin_q")
+RIVALS = ("sdac", "qsm", "dacer", "dipo")
 Processes = Annotated[int, Field(ge=1, le=4096)]
+
+
+def _methods(value: Any) -> Any:
+    return list(METHODS) if value == "all" else value
 
 
 def _clip(value: Any) -> Any:
@@ -62,7 +69,7 @@ class Collector(Section):
     frames: Count
     frames_per_batch: Count
     warmup_frames: Annotated[int, Field(ge=0)]
-    guidance_weight: dict[Method, NonNegative]
+    guidance_weight: dict[Literal[GUIDED], NonNegative]
 
 
 class Critic(Section):
@@ -97,6 +104,26 @@ class Chain(Section):
     normalize_gradient: bool
     langevin_step_size: Positive
 
+    def make_schedule(self, name: str) -> NoiseSchedule:
+        """The schedule of that name; the linear one has the betas given here."""
+        settings = self.linear.model_dump() if name == "linear" else {}
+        return getattr(NoiseSchedule, name)(self.num_steps, **settings)
+
+
+class Rival(Section):
+    """A diffusion policy, and how it is trained."""
+
+    schedule: Literal["linear", "cosine", "vp"]
+    clip_denoised: Clip
+    num_cells: Widths
+    lr: Positive  # of the policy; the critic's is that of all methods
+    tau: Annotated[float, Field(gt=0, le=1)]
+    updates_per_batch: Count
+    actor_interval: Count
+    exploration_noise: NonNegative
+    loss: dict[str, Any]  # arguments of the method's loss
+    chosen: Annotated[dict[str, Any], Field(max_length=1)]  # one more, chosen by reward; or none
+
 
 class Sweep(Section):
     """The guidance weights to choose from."""
@@ -114,7 +141,7 @@ class Report(Section):
 class BanditConfig(Section):
     """`bandit_2d.yaml`."""
 
-    methods: Annotated[list[Method], Field(min_length=1)]
+    methods: Annotated[list[Method], Field(min_length=1), BeforeValidator(_methods)]
     seeds: Annotated[list[Seed], Field(min_length=1)]
     num_workers: Processes
     num_threads: Processes
@@ -126,6 +153,7 @@ class BanditConfig(Section):
     critic: Critic
     optim: Optim
     chain: Chain
+    rivals: dict[Literal[RIVALS], Rival]
     sweep: Sweep
     report: Report
 
@@ -134,8 +162,10 @@ class BanditConfig(Section):
         size = self.collector.frames_per_batch
         if self.collector.frames % size:
             self.refuse("collector.frames", f"a multiple of collector.frames_per_batch ({size})")
-        if missing := set(self.methods) - self.collector.guidance_weight.keys():
+        if missing := set(self.methods) & set(GUIDED) - self.collector.guidance_weight.keys():
             self.refuse("collector.guidance_weight", f"a weight for {sorted(missing)} as well")
+        if missing := set(self.methods) & set(RIVALS) - self.rivals.keys():
+            self.refuse("rivals", f"settings of {sorted(missing)} as well")
         return self
 
 

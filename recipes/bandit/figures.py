@@ -12,15 +12,22 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from bandit.config import GUIDED, RIVALS
 from bandit.env import HIGH_MODES, MODE_STD, reward
 from torchrl_aca import CriticGuidedDenoisingActor
+from torchrl_aca.baselines import DiffusionPolicy
 
-Actors = Mapping[str, CriticGuidedDenoisingActor]
+Actor = CriticGuidedDenoisingActor | DiffusionPolicy
+Actors = Mapping[str, Actor]
 
 LABELS = {
     "aca": "Diffusion-$Q_t$ (ACA)",
     "diffusion_q": "Diffusion-$Q$",
     "langevin_q": "Langevin-$Q$",
+    "sdac": "SDAC",
+    "qsm": "QSM",
+    "dacer": "DACER",
+    "dipo": "DIPO",
 }
 COLORS = {"aca": "#0072B2", "diffusion_q": "#D55E00", "langevin_q": "#009E73"}  # Okabe and Ito
 HALF_WIDTH = 2.3  # of all maps: the same axes everywhere
@@ -37,15 +44,22 @@ def draw_figures(
     paths = {method: grid_trajectory(actor) for method, actor in actors.items()}
     figures = {
         "reward": reward_map(),
-        "samples": overview(actors, reported),
-        "sensitivity": sensitivity(swept),
         **{f"steps_{method}": all_steps(LABELS[method], path) for method, path in paths.items()},
     }
+    guided, trained = (
+        {m: a for m, a in actors.items() if m in which} for which in (GUIDED, RIVALS)
+    )
+    if guided:
+        figures["samples"], figures["sensitivity"] = overview(guided, reported), sensitivity(swept)
+    if trained:
+        figures["samples_rivals"] = overview(trained, reported)
     if {"aca", "diffusion_q"} <= actors.keys():
         figures["value_maps"] = value_maps(actors)
     for name, figure in figures.items():
         figure.savefig(run_dir / f"{name}.png", dpi=90, bbox_inches="tight")
-    animate(paths, run_dir / "steps.gif")
+    for name, group in (("steps", guided), ("steps_rivals", trained)):
+        if group:
+            animate({method: paths[method] for method in group}, run_dir / f"{name}.gif")
 
 
 def plane(num: int = 161) -> Tensor:
@@ -85,8 +99,9 @@ def reward_map() -> Figure:
     return figure
 
 
+@torch.no_grad()
 def overview(actors: Actors, reported: Sequence[Mapping]) -> Figure:
-    """Figure 3 of the paper: the reward, and for each method arrows from a_T to a_0."""
+    """Figures 3 and 4 of the paper: the reward, and for each method arrows from a_T to a_0."""
     figure, axes = row_of_axes(len(actors) + 1)
     show_map(axes[0], reward(plane()), "reward")
     mark_high_modes(axes[0])
@@ -163,7 +178,8 @@ def sensitivity(swept: Sequence[Mapping]) -> Figure:
     return figure
 
 
-def grid_trajectory(actor: CriticGuidedDenoisingActor, num: int = 17) -> Tensor:
+@torch.no_grad()
+def grid_trajectory(actor: Actor, num: int = 17) -> Tensor:
     """Every step of chains that start on a grid, (T+1, num^2, 2)."""
     line = torch.linspace(-2, 2, num)
     start = torch.cartesian_prod(line, line)

@@ -11,18 +11,33 @@ from typing import Any
 
 from bandit.env import HIGH_MODES
 
-METHODS = {"aca": "ACA", "diffusion_q": "Diffusion-Q", "langevin_q": "Langevin-Q"}
+METHODS = {
+    "aca": "ACA",
+    "diffusion_q": "Diffusion-Q",
+    "langevin_q": "Langevin-Q",
+    "sdac": "SDAC",
+    "qsm": "QSM",
+    "dacer": "DACER",
+    "dipo": "DIPO",
+}
 PAPER = {
     "aca": (0.240, 0.256, 0.243, 0.254, 0.993),
     "diffusion_q": (0.141, 0.182, 0.160, 0.153, 0.636),
     "langevin_q": (0.141, 0.147, 0.139, 0.143, 0.570),
+    "sdac": (0.227, 0.227, 0.239, 0.234, 0.927),
+    "qsm": (0.118, 0.115, 0.117, 0.115, 0.465),
+    "dacer": (0.000, 1.000, 0.000, 0.000, 1.000),
+    "dipo": (0.100, 0.099, 0.104, 0.098, 0.401),
 }
 NUMBERS = (*HIGH_MODES, "sum", "reward_mean", "reward_std")
 Row = dict[str, Any]
 
 
 def summary(rows: Sequence[Row]) -> list[Row]:
-    """Means over the seeds, one row for each method, each beside the paper's."""
+    """Means over the seeds, one row for each method, each beside the paper's.
+
+    `w` is what the reward has chosen: the guidance weight, or the one setting of a rival.
+    """
     table = []
     for method, label in METHODS.items():
         runs = [row for row in rows if row["method"] == method]
@@ -30,7 +45,7 @@ def summary(rows: Sequence[Row]) -> list[Row]:
             continue
         mean = {key: statistics.fmean(run[key] for run in runs) for key in NUMBERS}
         sums = [run["sum"] for run in runs]
-        weights = " ".join(f"{run['weight']:g}" for run in runs)
+        weights = " ".join(f"{run['weight']:g}" for run in runs if run["weight"] is not None)
         table.append(
             {"method": label, "source": f"here, {len(runs)} seeds"}
             | {key: f"{value:.3f}" for key, value in mean.items()}

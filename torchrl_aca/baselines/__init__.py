@@ -1,8 +1,10 @@
 """Rivals of ACA: what TorchRL does not have, as TorchRL parts. The recipes make agents of them."""
 
 from torchrl_aca.baselines.cql import CalQLLoss, EnsembleCQLLoss
+from torchrl_aca.baselines.dacer import DACERLoss
 from torchrl_aca.baselines.diffusion_loss import DiffusionPolicyLoss
 from torchrl_aca.baselines.diffusion_policy import DiffusionPolicy
+from torchrl_aca.baselines.dipo import DIPOLoss
 from torchrl_aca.baselines.ensemble import EnsembleMLP
 from torchrl_aca.baselines.ensemble_sac import EnsembleSACLoss
 from torchrl_aca.baselines.iql import EnsembleIQLLoss
@@ -13,6 +15,8 @@ from torchrl_aca.baselines.sdac import SDACLoss
 
 __all__ = [
     "CalQLLoss",
+    "DACERLoss",
+    "DIPOLoss",
     "DiffusionPolicy",
     "DiffusionPolicyLoss",
     "EnsembleCQLLoss",

@@ -198,9 +198,22 @@ class DiffusionPolicy(TensorDictModuleBase):
         Returns:
             All candidates in [-1, 1] units, shape ``(N, B, A)``.
         """
+        return self._chains(observation, noise, keep_path=False)
+
+    def trajectory(self, observation: Tensor, noise: Tensor) -> Tensor:
+        """As :meth:`denoise`, with every step kept: ``a_T .. a_0``, shape ``(T + 1, N, B, A)``.
+
+        Args:
+            observation: as in :meth:`denoise`.
+            noise: as in :meth:`denoise`.
+        """
+        return self._chains(observation, noise, keep_path=True)
+
+    def _chains(self, observation: Tensor, noise: Tensor, keep_path: bool) -> Tensor:
         features = self.network.encode(observation)
         how: dict[str, Any] = {
             "initial_scale": self.initial_scale,
+            "keep_path": keep_path,
             "tile_rows": self.tile_rows,
             "run": self._run,
         }
@@ -234,7 +247,8 @@ class DiffusionPolicy(TensorDictModuleBase):
             action: actions of shape ``(*batch, A)``.
             draw: standard normal draws of the same shape.
         """
-        action = action + self.exploration_noise * self.log_alpha.exp() * draw
+        # Detached: where a loss differentiates the action, it is not by alpha.
+        action = action + self.exploration_noise * self.log_alpha.detach().exp() * draw
         return action.clamp(-1, 1) if self.clip_action else action
 
     # --- acting -----------------------------------------------------------------------------------

@@ -149,7 +149,9 @@ class SDACLoss(OpenLoopAlpha, DiffusionPolicyLoss):
         schedule = self.actor_network.schedule
         draws = noisy_action.new_empty(self.num_proposals, *noisy_action.shape).normal_()
         alpha_cumprod = schedule.at(schedule.alphas_cumprod, level, noisy_action.dtype)
-        clean = F.predict_clean(noisy_action, draws, alpha_cumprod).clamp(-1, 1)
+        clean = F.predict_clean(noisy_action, draws, alpha_cumprod)
+        if bound := float(self.actor_network.clip_denoised):  # that of the policy's own estimates
+            clean = clean.clamp(-bound, bound)
         values = self.actor_network.values(observation, clean).amin(-1)
         beta = self.inverse_temperature / self.log_alpha.exp()
         return reverse_sampling_target(draws, values, beta)

@@ -4,7 +4,9 @@ from torchrl_aca.replay.buffer import (
     TRANSITION_KEYS,
     BufferState,
     make_replay_buffer,
+    require_index,
     transitions,
+    write_back,
 )
 from torchrl_aca.replay.episodes import FinishedEpisodes
 from torchrl_aca.replay.mixture import MixedReplayBuffer
@@ -16,6 +18,8 @@ __all__ = [
     "FinishedEpisodes",
     "MixedReplayBuffer",
     "make_replay_buffer",
+    "require_index",
     "transitions",
     "with_last_flags",
+    "write_back",
 ]

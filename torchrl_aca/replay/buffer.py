@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
-from torchrl.data import LazyTensorStorage, ReplayBuffer, TensorDictReplayBuffer
+from torchrl.data import LazyTensorStorage, ReplayBuffer, TensorDictReplayBuffer, TensorStorage
 
-__all__ = ["TRANSITION_KEYS", "BufferState", "make_replay_buffer", "transitions"]
+__all__ = [
+    "TRANSITION_KEYS",
+    "BufferState",
+    "make_replay_buffer",
+    "require_index",
+    "transitions",
+    "write_back",
+]
 
 TRANSITION_KEYS: tuple[NestedKey, ...] = (
     "observation",
@@ -27,14 +34,47 @@ def make_replay_buffer(capacity: int, batch_size: int) -> TensorDictReplayBuffer
     return TensorDictReplayBuffer(storage=LazyTensorStorage(capacity), batch_size=batch_size)
 
 
-def transitions(data: TensorDictBase, extra_keys: Sequence[NestedKey] = ()) -> TensorDictBase:
+def transitions(
+    data: TensorDictBase,
+    extra_keys: Sequence[NestedKey] = (),
+    rewritten: Mapping[NestedKey, NestedKey] | None = None,
+) -> TensorDictBase:
     """Flattens collected data of shape (num_envs, steps) and keeps what learning needs.
 
     Args:
         data: What a collector gives.
         extra_keys: What a method needs in a row besides the transition.
+        rewritten: Entries that a method will rewrite, each with the one that it begins as.
     """
-    return data.select(*TRANSITION_KEYS, *extra_keys).reshape(-1)
+    rows = data.select(*TRANSITION_KEYS, *extra_keys).reshape(-1)
+    for key, first in (rewritten or {}).items():
+        rows[key] = rows[first].clone()
+    return rows
+
+
+def require_index(buffer: Any) -> None:
+    """Refuses a buffer whose batches do not tell where their rows lie.
+
+    Raises:
+        ValueError: If its batches have no "index", or its rows cannot be written one by one.
+    """
+    storage = getattr(buffer, "storage", None)
+    if not isinstance(buffer, TensorDictReplayBuffer) or not isinstance(storage, TensorStorage):
+        raise ValueError(
+            "rows can be rewritten in a TensorDictReplayBuffer with a TensorStorage alone, whose "
+            f"batches hold the index of each row; got a {type(buffer).__name__}."
+        )
+
+
+def write_back(
+    buffer: TensorDictReplayBuffer, batch: TensorDictBase, keys: Iterable[NestedKey]
+) -> None:
+    """Writes entries of a sampled batch to the rows that it was sampled from, by their index."""
+    rows = buffer.storage[:]
+    for key in keys:
+        column = rows.get(key)
+        index = batch["index"].to(column.device)
+        column.index_copy_(0, index, batch[key].to(column))
 
 
 class BufferState:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from tensordict import TensorDictBase
@@ -35,7 +35,7 @@ class Agent:
             `ExplorationType.RANDOM`, the evaluation under `ExplorationType.DETERMINISTIC`.
         update: Takes a batch of transitions of shape (B,), makes one update and returns detached
             scalar metrics. A metric that is not there in every update is averaged over the
-            updates that report it.
+            updates that report it. It leaves the batch as it is, but for what it `rewrites`.
         state: Everything that the next update depends on, by name: the loss with its targets,
             optimisers, schedulers, counters. It is what a checkpoint saves and restores.
         offline_update: As `update`, for the phase on the data set alone; None for a method that
@@ -45,6 +45,8 @@ class Agent:
             buffer, (n,), where n may be 0; None: all transitions with their `extra_keys`.
         offline_rows: Takes a data set of shape (n,), episode after episode, and returns it with
             its `extra_keys`; None: it has them already.
+        rewrites: Entries of a row that `update` changes in its batch, and the loop then in the
+            buffer; each with the entry of the transition that it begins as.
     """
 
     policy: TensorDictModuleBase
@@ -54,10 +56,13 @@ class Agent:
     extra_keys: tuple[NestedKey, ...] = ()
     rows: Rows | None = None
     offline_rows: Rows | None = None
+    rewrites: Mapping[NestedKey, NestedKey] = field(default_factory=dict)
 
     def rows_of(self, data: TensorDictBase) -> TensorDictBase:
         """Returns what of collected data goes to the replay buffer."""
-        return self.rows(data) if self.rows else transitions(data, self.extra_keys)
+        if self.rows is not None:
+            return self.rows(data)
+        return transitions(data, self.extra_keys, self.rewrites)
 
     def offline_rows_of(self, data: TensorDictBase) -> TensorDictBase:
         """Returns a data set with what the method needs in its rows."""

@@ -17,7 +17,7 @@ from tensordict import TensorDictBase
 from torchrl.data import ReplayBuffer
 
 from torchrl_aca.errors import RunError
-from torchrl_aca.replay import TRANSITION_KEYS, BufferState
+from torchrl_aca.replay import TRANSITION_KEYS, BufferState, require_index, write_back
 from torchrl_aca.training.agent import Agent, Stateful
 from torchrl_aca.training.checkpoint import Counters, restore, save_checkpoint
 from torchrl_aca.training.collection import BadDataError, Collection
@@ -87,6 +87,7 @@ class Run:
         self.means, self.completed = MetricMeans(), False
         self.script, self.facts = script, facts or {}
         self._evaluate, self._device = evaluate, device
+        self._check_needs(buffer)
         self.parts: dict[str, Stateful] = {
             **{f"agent.{name}": part for name, part in agent.state.items()},
             "buffer": as_stateful(buffer, agent),
@@ -95,11 +96,6 @@ class Run:
             "counters": self.counters,
             "random": RandomState(),  # the last one, because restoring the others may draw
         }
-        if cfg.optim.offline_updates and agent.offline_update is None:
-            raise RunError(
-                f"optim.offline_updates={cfg.optim.offline_updates}: expected 0, because "
-                f"algo={cfg.algo.name} has no offline phase. Leave it out."
-            )
         if checkpoint is not None:
             self._restore(checkpoint)
         notes = self._savable_parts()
@@ -117,6 +113,21 @@ class Run:
             raise
 
     # --- beginning --------------------------------------------------------------------------------
+
+    def _check_needs(self, buffer: Any) -> None:
+        cfg, agent = self.cfg, self.agent
+        if cfg.optim.offline_updates and agent.offline_update is None:
+            raise RunError(
+                f"optim.offline_updates={cfg.optim.offline_updates}: expected 0, because "
+                f"algo={cfg.algo.name} has no offline phase. Leave it out."
+            )
+        if agent.rewrites:
+            try:
+                require_index(buffer)
+            except ValueError as error:
+                raise RunError(
+                    f"algo={cfg.algo.name} rewrites rows of its buffer: {error}"
+                ) from error
 
     def _restore(self, checkpoint: dict[str, Any]) -> None:
         done, total = checkpoint["parts"]["counters"].get("updates"), self.cfg.optim.total_updates
@@ -203,14 +214,18 @@ class Run:
     def due(self, buffer: Any) -> Iterator[TensorDictBase]:
         """Yields a batch for each update that the frames so far call for.
 
-        They wait for the first row of experience, where a method keeps rows back.
+        They wait for the first row of experience, where a method keeps rows back. What the method
+        rewrites in a batch goes back to its rows afterwards.
         """
         self._since = self.counters.updates
         due = updates_due(self.cfg, self.collection.frames)
         if not len(getattr(buffer, "online", buffer)):
             return
         while self.counters.updates < due:
-            yield buffer.sample().to(self._device)
+            batch = buffer.sample().to(self._device)
+            yield batch
+            if self.agent.rewrites:
+                write_back(buffer, batch, self.agent.rewrites)
             self.counters.updates += 1
 
     def add(self, metrics: TensorDictBase) -> None:
@@ -325,7 +340,7 @@ def as_stateful(buffer: Any, agent: Agent) -> Stateful:
     """Returns what saves a buffer: TorchRL's own state would hold the empty part as well."""
     if not isinstance(buffer, ReplayBuffer):
         return buffer
-    return BufferState(buffer, (*TRANSITION_KEYS, *agent.extra_keys))
+    return BufferState(buffer, (*TRANSITION_KEYS, *agent.extra_keys, *agent.rewrites))
 
 
 def check_rows(state: Mapping[str, Any], collection: Collection) -> None:
