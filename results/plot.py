@@ -5,7 +5,8 @@
 Runs that differ in nothing but their seed are one curve: the mean over seeds, and each seed thin.
 A curve of a single run has a band of one standard deviation over episodes. Updates of an offline
 phase are below zero, so that the online phases of all runs begin at the same place. The table is
-printed in Markdown. Needs the `recipes` extra; reads config.yaml and eval.csv of each run directory.
+printed in Markdown. Needs the `recipes` extra; reads config.yaml and eval.csv of each run
+directory.
 """
 
 from __future__ import annotations
