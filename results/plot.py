@@ -3,8 +3,10 @@
     python results/plot.py results/quickstart/curve.png results/quickstart/seed* --line random=5
 
 Runs that differ in nothing but their seed are one curve: the mean over seeds, and each seed thin.
-A curve of a single run has a band of one standard deviation over episodes. The table is printed in
-Markdown. Needs the `recipes` extra; reads config.yaml and eval.csv of each run directory.
+A curve of a single run has a band of one standard deviation over episodes. Updates of an offline
+phase are below zero, so that the online phases of all runs begin at the same place. The table is
+printed in Markdown. Needs the `recipes` extra; reads config.yaml and eval.csv of each run
+directory.
 """
 
 from __future__ import annotations
@@ -38,6 +40,8 @@ class Run:
         config = OmegaConf.to_container(OmegaConf.load(run_dir / "config.yaml"))
         with open(run_dir / "eval.csv", newline="") as file:
             rows = [{k: float(v) for k, v in row.items()} for row in csv.DictReader(file)]
+        for row in rows:
+            row["updates"] += row.get("offline_updates", 0) - rows[-1].get("offline_updates", 0)
         return cls(run_dir, config, rows)
 
     @property
@@ -66,7 +70,8 @@ class Curve:
     @property
     def label(self) -> str:
         config, seeds = self.runs[0].config, [run.config["seed"] for run in self.runs]
-        without = ", no offline data" if config.get("offline_fraction") == 0 else ""
+        phase = config["optim"].get("offline_updates")
+        without = ", no offline data" if config.get("offline_fraction") == 0 and not phase else ""
         count = f"{len(seeds)} seeds" if len(seeds) > 1 else f"seed {seeds[0]}"
         return f"{config['algo']['name']}{without}, {count}"
 
@@ -144,6 +149,8 @@ def main() -> None:
     axes = figure.subplots()
     for curve, label in zip(curves, labels(curves), strict=True):
         draw(axes, curve, label)
+    if any(curve.shared()[0] < 0 for curve in curves):
+        axes.axvline(0, color="0.4", linestyle=":", linewidth=1, label="end of the offline phase")
     for text in arguments.line:
         name, value = text.split("=")
         axes.axhline(float(value), color="0.4", linestyle="--", linewidth=1, label=name)

@@ -78,6 +78,14 @@ def test_a_curve_is_its_mean_and_each_seed(plot, tmp_path):
     assert drawn == [[1.0, 2.5], [1.0, 2.0], [1.0, 3.0]]
 
 
+def test_updates_of_an_offline_phase_come_before_zero(plot, tmp_path):
+    run_dir = write_run(tmp_path / "a", {0: 1.0})
+    rows = ["updates,offline_updates,return_mean,return_std", "0,0,1,0", "0,20,2,0", "10,20,3,0"]
+    (run_dir / "eval.csv").write_text("\n".join(rows))
+    (curve,) = plot.make_curves([run_dir])
+    assert plot.table([curve]).splitlines()[2:] == ["| -20 | 1 |", "| 0 | 2 |", "| 10 | 3 |"]
+
+
 def test_command_writes_the_figure_and_prints_the_table(tmp_path):
     runs = [write_run(tmp_path / f"{s}", {0: 1.0, 10: 2.0 + s}, seed=s) for s in (0, 1)]
     script, figure = str(RESULTS / "plot.py"), tmp_path / "curve.svg"

@@ -10,15 +10,8 @@ from pydantic import Field
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
-from agents.ensemble import (
-    DelayedActor,
-    EnsembleSACSettings,
-    EnsembleSteps,
-    actor_interval,
-    both,
-    make_critics,
-    make_policy,
-)
+from agents.ensemble import EnsembleSACSettings, make_critics, make_policy
+from agents.ensemble_steps import DelayedActor, EnsembleSteps, actor_interval, both
 from torchrl_aca.baselines import CalQLLoss, EnsembleCQLLoss
 from torchrl_aca.offline import return_bounds
 from torchrl_aca.offline.bounds import Tail

@@ -7,14 +7,8 @@ from typing import Any, ClassVar
 import torch
 from torchrl.envs import EnvBase
 
-from agents.ensemble import (
-    DelayedActor,
-    EnsembleSACSettings,
-    EnsembleSteps,
-    actor_interval,
-    make_critics,
-    make_policy,
-)
+from agents.ensemble import EnsembleSACSettings, make_critics, make_policy
+from agents.ensemble_steps import DelayedActor, EnsembleSteps, actor_interval
 from torchrl_aca.baselines import EnsembleSACLoss
 from torchrl_aca.training.agent import Agent
 from torchrl_aca.training.config import Count, Optim, Positive

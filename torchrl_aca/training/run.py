@@ -249,10 +249,10 @@ class Run:
             self.log_metrics()
         if passed(cfg.eval.interval, since, now) or last:
             self.log_evaluation()
+        if now == last_offline:  # before the checkpoint, after which the phase is not made again
+            save_pretrained(self.dir, self.parts, self.config, self.facts)
         if passed(cfg.checkpoint.interval, since, now) or now == last_offline:
             self.save()
-        if now == last_offline:
-            save_pretrained(self.dir, self.parts, self.config, self.facts)
         self.bar.advance(self.counters.total)
 
     # --- what it leaves ---------------------------------------------------------------------------
