@@ -29,7 +29,7 @@ from torchrl_aca import CriticGuidedDenoisingActor
 from torchrl_aca.errors import RunError
 from torchrl_aca.training.checkpoint import list_checkpoints, read_checkpoint, updates_of
 
-CANDIDATES, TEST_SAMPLES, PERMUTATIONS = 128, 2000, 199
+CANDIDATES, TEST_SAMPLES, PERMUTATIONS = 128, 2000, 199  # of a state
 
 
 def measure_checkpoint(
@@ -80,7 +80,6 @@ class _Chain:
             guidance_weight=float(actor.guidance_weight),
             inference_levels=levels,
             normalize_gradient=not args.raw_gradient,
-            compile_step=True,
         )
 
     @torch.no_grad()

@@ -1,0 +1,80 @@
+"""The comparison of short chains with the whole one: its measures, its spacings, its command."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+import chain_fidelity
+from fidelity.measures import energy_distance_test, spread
+from fidelity.spacings import PACKAGE, SPACINGS, levels_of
+from online_mujoco import train
+from recipe_cases import TINY, composed, rows_of
+from torchrl_aca import NoiseSchedule
+from torchrl_aca.chain import check_levels, inference_levels
+
+
+def test_energy_distance_by_hand():
+    # 2 E|X - Y| - E|X - X'| - E|Y - Y'| = 2 * 2 - 1/2 - 1/2
+    samples, others = torch.tensor([[0.0], [1.0]]), torch.tensor([[2.0], [3.0]])
+    distance, p = energy_distance_test(samples, others, 99, torch.Generator().manual_seed(0))
+    assert distance == pytest.approx(3.0)
+    assert p > 0.1  # a third of the shuffles of four points separate them as well
+
+
+def test_the_test_tells_a_shift_from_none():
+    generator = torch.Generator().manual_seed(1)
+    samples, others = torch.randn(2, 300, 2, generator=generator)
+    _, same = energy_distance_test(samples, others, 199, generator)
+    _, apart = energy_distance_test(samples, others + 0.4, 199, generator)
+    assert same > 0.05 and apart == pytest.approx(1 / 200)
+
+
+def test_the_spread_is_over_the_candidates():
+    # Deviations of (0, 2) and (1, 1): sqrt 2 and 0.
+    assert spread(torch.tensor([[0.0, 1.0], [2.0, 1.0]])) == pytest.approx(2**0.5 / 2)
+
+
+@pytest.mark.parametrize("spacing", [PACKAGE, *SPACINGS])
+@pytest.mark.parametrize("kind", ["cosine", "linear", "vp"])
+def test_every_spacing_rises_from_1_to_the_top(spacing, kind):
+    for num_levels in (5, 20, 100):
+        schedule = getattr(NoiseSchedule, kind)(num_levels)
+        for num_steps in (2, 4, num_levels - 1, num_levels):
+            levels = levels_of(spacing, schedule, num_steps)
+            assert check_levels(levels, num_levels) == levels and len(levels) == num_steps
+
+
+def test_the_spacings_are_what_their_names_say():
+    schedule = NoiseSchedule.cosine(21)
+    assert levels_of("even", schedule, 5) == [1, 6, 11, 16, 21]
+    assert levels_of("quadratic", schedule, 5) == [1, 2, 6, 12, 21]  # 1 + 20 (k / 4)^2
+    assert levels_of("geometric", NoiseSchedule.cosine(16), 5) == [1, 2, 4, 8, 16]
+    assert levels_of(PACKAGE, schedule, 5) == inference_levels(schedule, 5)
+
+
+@pytest.mark.parametrize("raw", [False, True])
+def test_the_command_compares_chains_on_the_checkpoints_of_a_run(raw, tmp_path, capsys):
+    run_dir = tmp_path / "run"
+    train(composed(*TINY["aca"], "aca.num_steps=5", f"run_dir={run_dir}", "checkpoint.keep_last=9"))
+    sizes = ["--states", "6", "--tested-states", "2", "--steps", "3", "9"]
+    options = ["--raw-gradient"] if raw else []
+    updates = ["--updates", "25", "60"]
+    out = tmp_path / "out"
+    chain_fidelity.main([str(run_dir), *updates, *sizes, *options, "--out", str(out)])
+    rows = rows_of(out / "fidelity.csv")
+    assert [row["spacing"] for row in rows] == 2 * ["all", PACKAGE, *SPACINGS]  # none of 9 of 5
+    assert [row["gradients"] for row in rows] == 2 * ["4", *["2"] * (1 + len(SPACINGS))]
+    assert {row["normalized"] for row in rows} == {str(not raw)}
+    assert all(0.5 < float(row["std_ratio"]) < 2 for row in rows if row["spacing"] == "all")
+    assert (out / "fidelity.png").stat().st_size > 0
+    assert "| all | 4 | 1 2 3 4 5 |" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match="expected a checkpoint of 7 updates, found those of"):
+        chain_fidelity.main([str(run_dir), "--updates", "7", "--out", str(out)])
+
+
+def test_a_method_without_a_guided_chain_is_told(tmp_path):
+    run_dir = tmp_path / "run"
+    train(composed(*TINY["sac"], f"run_dir={run_dir}"))
+    with pytest.raises(SystemExit, match="algo=sac has no chain to shorten"):
+        chain_fidelity.main([str(run_dir), "--out", str(tmp_path / "out")])
