@@ -54,7 +54,10 @@ def test_the_spacings_are_what_their_names_say():
 
 
 @pytest.mark.parametrize("raw", [False, True])
-def test_the_command_compares_chains_on_the_checkpoints_of_a_run(raw, tmp_path, capsys):
+def test_the_command_compares_chains_on_the_checkpoints_of_a_run(
+    raw, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr(chain_fidelity, "TEST_SAMPLES", 100)
     run_dir = tmp_path / "run"
     train(composed(*TINY["aca"], "aca.num_steps=5", f"run_dir={run_dir}", "checkpoint.keep_last=9"))
     sizes = ["--states", "6", "--tested-states", "2", "--steps", "3", "9"]
