@@ -134,6 +134,14 @@ def test_rivals_measure_chains_without_exploration_noise(method):
     assert noisy.abs().max() > 10
 
 
+def test_a_method_and_a_seed_give_the_same_numbers_whatever_ran_before():
+    cfg = composed(*TINY, "methods=all")
+    (alone,), _, _ = bandit_2d.run((cfg, "qsm", 0))
+    bandit_2d.run((cfg, "dacer", 1))
+    (again,), _, _ = bandit_2d.run((cfg, "qsm", 0))
+    assert alone == again
+
+
 def test_dipo_keeps_its_best_actions_in_the_box_of_the_random_ones(monkeypatch):
     seen = []
     improve = DIPOLoss.improve
