@@ -50,7 +50,8 @@ def test_the_spacings_are_what_their_names_say():
     assert levels_of("even", schedule, 5) == [1, 6, 11, 16, 21]
     assert levels_of("quadratic", schedule, 5) == [1, 2, 6, 12, 21]  # 1 + 20 (k / 4)^2
     assert levels_of("geometric", NoiseSchedule.cosine(16), 5) == [1, 2, 4, 8, 16]
-    assert levels_of(PACKAGE, schedule, 5) == inference_levels(schedule, 5)
+    assert levels_of("low", schedule, 5) == [1, 2, 4, 10, 21]  # 1 + 9 (k / 3)^3, and the top
+    assert levels_of(PACKAGE, schedule, 5) == inference_levels(21, 5)
 
 
 @pytest.mark.parametrize("raw", [False, True])

@@ -147,7 +147,7 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         anchor = first_parameter(self.critic)
         # A copy: `to` works in place, and the schedule may serve actors on other devices too.
         self.schedule = copy.deepcopy(schedule).to(anchor.device)
-        self.inference_levels = _levels(schedule, num_inference_steps, inference_levels)
+        self.inference_levels = _levels(schedule.num_steps, num_inference_steps, inference_levels)
         self.num_inference_steps = len(self.inference_levels)
         self.chain_schedule = self.schedule.restrict(self.inference_levels)
         self.num_candidates = num_candidates
@@ -377,13 +377,13 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         return tensordict.set(self.out_keys[0], action)
 
 
-def _levels(schedule: NoiseSchedule, number: int | None, levels: Sequence[int] | None) -> list[int]:
+def _levels(num_levels: int, num_steps: int | None, levels: Sequence[int] | None) -> list[int]:
     """The levels of the chain: all of them, or as many as asked for, or those given."""
     if levels is None:
-        return chain.inference_levels(schedule, schedule.num_steps if number is None else number)
-    if number is not None:
+        return chain.inference_levels(num_levels, num_levels if num_steps is None else num_steps)
+    if num_steps is not None:
         raise ValueError("Expected num_inference_steps or inference_levels, got both. Drop one.")
-    return chain.check_levels(levels, schedule.num_steps)
+    return chain.check_levels(levels, num_levels)
 
 
 def _clean_level(action: Tensor) -> Tensor:

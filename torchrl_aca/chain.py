@@ -30,43 +30,32 @@ __all__ = [
 Variance = Literal["posterior", "beta"]
 
 
-def inference_levels(schedule: NoiseSchedule, num_steps: int) -> list[int]:
-    """The levels that a chain of ``num_steps`` visits: the low ones, and one stride from ``T``.
+def inference_levels(num_levels: int, num_steps: int) -> list[int]:
+    """The levels that a chain of ``num_steps`` visits: densely at the bottom, sparsely at the top.
 
-    The last level is ``T``. The others lie between 1 and the highest level ``H`` whose signal is no
-    weaker than its noise, ``alpha_bar_H >= 1/2``: level ``k`` of ``n`` is ``1 + (H - 1) ((k - 1) /
-    (n - 1))^3``, rounded, or the next free one where that is taken. The low levels decide the
-    action: the stride of the guidance falls with the level, and the last strides leave the spread
-    of the candidates. Above ``H`` the clean estimate lies on the border of its box, whatever the
-    stride.
+    Level ``k`` of ``S`` is ``1 + (T - 1) ((k - 1) / (S - 1))^4``, rounded, or the next free one
+    where that is taken. The low levels decide the action: the stride of the guidance falls with the
+    level, and the last strides leave the spread of the candidates. At the high levels the clean
+    estimate lies on the border of its box, whatever the stride.
 
     Args:
-        schedule: the whole schedule, of ``T`` levels.
+        num_levels: number ``T`` of noise levels.
         num_steps: number ``S`` of steps, from 2 to ``T``; ``T`` itself gives the whole chain.
 
     Raises:
         ValueError: if ``num_steps`` is not one of those.
 
     Examples:
-        >>> inference_levels(NoiseSchedule.cosine(20), 8)
-        [1, 2, 3, 4, 5, 6, 9, 20]
+        >>> inference_levels(20, 10)
+        [1, 2, 3, 4, 5, 6, 7, 8, 13, 20]
     """
-    last = schedule.num_steps
-    if num_steps == last:
-        return list(range(1, last + 1))
-    if not isinstance(num_steps, int) or not 2 <= num_steps < last:
-        raise ValueError(f"Expected a number of steps from 2 to {last}, got {num_steps!r}.")
-    num_clear = int((schedule.alphas_cumprod >= 0.5).sum())
-    if num_clear == last:
-        return _cubic(last, num_steps)
-    return [*_cubic(max(num_clear, num_steps - 1), num_steps - 1), last]
-
-
-def _cubic(last: int, number: int) -> list[int]:
-    """``number`` rising levels from 1 to ``last``, in strides that grow as a cube."""
-    grid = torch.linspace(0, 1, number, dtype=torch.float64)
-    levels = (1 + (last - 1) * grid**3).round().long()
-    return torch.maximum(levels, torch.arange(1, number + 1)).tolist()
+    if num_steps == num_levels:
+        return list(range(1, num_levels + 1))
+    if not isinstance(num_steps, int) or not 2 <= num_steps < num_levels:
+        raise ValueError(f"Expected a number of steps from 2 to {num_levels}, got {num_steps!r}.")
+    grid = torch.linspace(0, 1, num_steps, dtype=torch.float64)
+    levels = (1 + (num_levels - 1) * grid**4).round().long()
+    return torch.maximum(levels, torch.arange(1, num_steps + 1)).tolist()
 
 
 def check_levels(levels: Sequence[int], num_levels: int) -> list[int]:

@@ -33,22 +33,29 @@ def log_snr(schedule: NoiseSchedule, grid: Tensor) -> Tensor:
     return 1.0 + (ratio - wanted[:, None]).abs().argmin(1)
 
 
+def low(schedule: NoiseSchedule, grid: Tensor) -> Tensor:
+    """The top, and below it cubic steps among the levels whose signal is above their noise."""
+    num_clear = int((schedule.alphas_cumprod >= 0.5).sum())
+    steps = 1 + (num_clear - 1) * (grid / grid[-2].clamp(min=0.5)) ** 3
+    return torch.cat([steps[:-1], steps.new_tensor([schedule.num_steps])])
+
+
 SPACINGS: dict[str, Callable[[NoiseSchedule, Tensor], Tensor]] = {
     "even": even,
     "log SNR": log_snr,
     "quadratic": power(2),
     "geometric": geometric,
     "cubic": power(3),
-    "quartic": power(4),
+    "low": low,
 }
-PACKAGE = "low"  # torchrl_aca.chain.inference_levels
+PACKAGE = "quartic"  # torchrl_aca.chain.inference_levels
 
 
 def levels_of(spacing: str, schedule: NoiseSchedule, num_steps: int) -> list[int]:
     """Returns rising levels from 1 to T: rounded, and moved apart where two would coincide."""
     num_levels = schedule.num_steps
     if spacing == PACKAGE or num_steps == num_levels:
-        return inference_levels(schedule, num_steps)
+        return inference_levels(num_levels, num_steps)
     grid = torch.linspace(0, 1, num_steps, dtype=torch.float64)
     levels = SPACINGS[spacing](schedule, grid).round().long().tolist()
     for k in range(1, num_steps):
