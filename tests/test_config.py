@@ -182,6 +182,7 @@ def test_every_configuration_is_a_valid_one():
             cfg = configured(composed(f"env={env}", f"algo={algo}"))
             assert cfg.algo.name == algo and isinstance(cfg, RunConfig)
     configured(composed(name="dataset_sac"))
+    assert configured(composed(name="fast")).aca.num_inference_steps == 10
     for algo in AGENTS:
         assert configured(composed(f"algo={algo}", name="quickstart")).optim.total_updates == 3000
     for variant in ("qsm_authors", "qvpo_sdac_repo"):
