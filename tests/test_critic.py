@@ -303,3 +303,8 @@ def test_compiles_without_a_graph_break(method, activation):
     arguments = features, torch.randn(CANDIDATES, BATCH, ACTION), torch.tensor(4)
     compiled = torch.compile(getattr(critic, method), fullgraph=True, backend="aot_eager")
     torch.testing.assert_close(compiled(*arguments), getattr(critic, method)(*arguments))
+
+
+def test_repr_tells_the_sizes():
+    text = repr(NoiseLevelCritic(5, 3, num_steps=7, num_cells=(8,)))
+    assert "num_members=2, num_in=24, num_out=8" in text  # 5 + 3 + 16 level features

@@ -27,9 +27,10 @@ ALLOWED = {
     "functional": set(),
     "checks": set(),
     "errors": set(),
+    "stacked": set(),
     "schedule": {"checks", "functional"},
     "chain": {"checks", "functional", "schedule"},
-    "critic": {"checks", "functional"},
+    "critic": {"checks", "functional", "stacked"},
     "custom_critic": {"functional", "critic"},
     "actor": {"checks", "functional", "schedule", "chain", "critic", "custom_critic"},
     "td_loss": {"checks", "functional"},
@@ -47,7 +48,7 @@ ALLOWED = {
 }
 # What each room may import besides itself.
 ROOMS = {
-    "baselines": {"checks", "functional", "schedule", "chain", "td_loss"},
+    "baselines": {"checks", "functional", "stacked", "schedule", "chain", "td_loss"},
     "replay": {"checks", "errors"},
     "offline": {"checks", "errors", "replay"},
     "training": {"checks", "errors", "replay"},

@@ -12,6 +12,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from torchrl_aca import functional as F
+from torchrl_aca.stacked import StackedLinear
 
 __all__ = ["NoiseLevelCritic", "NoiseLevelCriticBase"]
 
@@ -115,26 +116,6 @@ class NoiseLevelCriticBase(TensorDictModuleBase):
         return tensordict.set(self.value_key, value.reshape(*batch, value.shape[-1]))
 
 
-class _StackedLinear(nn.Module):
-    """``E`` independent linear layers as one product, ``(E, rows, in) -> (E, rows, out)``."""
-
-    def __init__(self, num_critics: int, num_in: int, num_out: int, **factory: Any) -> None:
-        super().__init__()
-        self.weight = nn.Parameter(torch.empty(num_critics, num_in, num_out, **factory))
-        self.bias = nn.Parameter(torch.empty(num_critics, 1, num_out, **factory))
-        self.reset_parameters()
-
-    def reset_parameters(self) -> None:
-        """Truncated normal of standard deviation ``fan_in^-1/2``, cut at two of them; zero bias."""
-        std = self.weight.shape[1] ** -0.5
-        nn.init.trunc_normal_(self.weight, std=std, a=-2 * std, b=2 * std)
-        nn.init.zeros_(self.bias)
-
-    def forward(self, x: Tensor) -> Tensor:
-        # Not baddbmm, which first fills its output with the bias: a compiler can fuse the sum.
-        return (x @ self.weight).add_(self.bias)
-
-
 class NoiseLevelCritic(NoiseLevelCriticBase):
     """The paper's critic: ``E`` independent MLPs of (observation, noisy action, level features).
 
@@ -202,8 +183,8 @@ class NoiseLevelCritic(NoiseLevelCriticBase):
         self.embedding_dim = embedding_dim
         self.activation = activation()
 
-        def linear(num_in: int, num_out: int) -> _StackedLinear:
-            return _StackedLinear(num_critics, num_in, num_out, device=device, dtype=dtype)
+        def linear(num_in: int, num_out: int) -> StackedLinear:
+            return StackedLinear(num_critics, num_in, num_out, device=device, dtype=dtype)
 
         self.level_in = linear(embedding_dim, 2 * embedding_dim)
         self.level_out = linear(2 * embedding_dim, embedding_dim)
@@ -256,12 +237,12 @@ class NoiseLevelCritic(NoiseLevelCriticBase):
         return observations[0].shape[:-1]
 
     @property
-    def _first(self) -> _StackedLinear:
-        return cast(_StackedLinear, self.hidden[0])
+    def _first(self) -> StackedLinear:
+        return cast(StackedLinear, self.hidden[0])
 
     @property
-    def _others(self) -> list[_StackedLinear]:
-        return cast("list[_StackedLinear]", list(self.hidden)[1:])
+    def _others(self) -> list[StackedLinear]:
+        return cast("list[StackedLinear]", list(self.hidden)[1:])
 
     def _first_weights(self) -> tuple[Tensor, ...]:
         """The first layer's weight, split by its inputs: observation, action, level features."""

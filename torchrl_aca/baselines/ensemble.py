@@ -8,6 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from torchrl_aca.stacked import StackedLinear
+
 __all__ = ["EnsembleMLP"]
 
 
@@ -59,17 +61,17 @@ class EnsembleMLP(nn.Module):
         factory = {"device": device, "dtype": dtype}
         layers: list[nn.Module] = []
         for num_in, num_out in zip(widths, num_cells, strict=False):
-            layers.append(_StackedLinear(num_members, num_in, num_out, **factory))
+            layers.append(StackedLinear(num_members, num_in, num_out, _xavier_uniform, **factory))
             if layer_norm:
                 layers.append(_StackedLayerNorm(num_members, num_out, **factory))
             layers.append(nn.ReLU())
-        layers.append(_StackedLinear(num_members, widths[-1], 1, **factory))
+        layers.append(StackedLinear(num_members, widths[-1], 1, _xavier_uniform, **factory))
         self.layers = nn.Sequential(*layers)
 
     @property
     def weights(self) -> list[nn.Parameter]:
         """The linear layers' weights, first to last, ``(E, in, out)`` each."""
-        return [layer.weight for layer in self.layers if isinstance(layer, _StackedLinear)]
+        return [layer.weight for layer in self.layers if isinstance(layer, StackedLinear)]
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """Outputs ``(*batch, E)`` for inputs ``(*batch, ...)``, joined along the last dimension."""
@@ -79,18 +81,10 @@ class EnsembleMLP(nn.Module):
         return self.layers(rows).squeeze(-1).mT.reshape(*x.shape[:-1], weight.shape[0])
 
 
-class _StackedLinear(nn.Module):
-    """``E`` linear layers, ``(E, rows, in) -> (E, rows, out)``."""
-
-    def __init__(self, num_members: int, num_in: int, num_out: int, **factory: Any) -> None:
-        super().__init__()
-        self.weight = nn.Parameter(torch.empty(num_members, num_in, num_out, **factory))
-        self.bias = nn.Parameter(torch.zeros(num_members, 1, num_out, **factory))
-        for member in self.weight:  # of the stack, Xavier's rule would misread the sizes
-            nn.init.xavier_uniform_(member)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return torch.baddbmm(self.bias, x, self.weight)
+def _xavier_uniform(weight: Tensor, num_in: int) -> None:
+    """Member by member: of the stack, Xavier's rule would misread the sizes."""
+    for member in weight:
+        nn.init.xavier_uniform_(member)
 
 
 class _StackedLayerNorm(nn.Module):

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from torchrl_aca import functional as F
 from torchrl_aca.checks import check_choice
+from torchrl_aca.stacked import StackedLinear, truncated_normal_
 
 __all__ = ["NoiseNetwork", "TwinCritic", "action_gradient"]
 
@@ -197,9 +198,9 @@ class TwinCritic(nn.Module):
         self.activation = activation()
         self._first_sizes = [observation_dim, action_dim]
         widths = [observation_dim + action_dim, *num_cells, num_outputs]
-        factory = {"device": device, "dtype": dtype}
+        factory: dict[str, Any] = {"device": device, "dtype": dtype}
         self.layers = nn.ModuleList(
-            _StackedLinear(num_critics, i, o, **factory) for i, o in pairwise(widths)
+            StackedLinear(num_critics, i, o, **factory) for i, o in pairwise(widths)
         )
 
     def encode(self, observation: Tensor) -> Tensor:
@@ -232,37 +233,19 @@ class TwinCritic(nn.Module):
         return self.evaluate(self.encode(observation), action)
 
     @property
-    def _first(self) -> _StackedLinear:
-        return cast(_StackedLinear, self.layers[0])
+    def _first(self) -> StackedLinear:
+        return cast(StackedLinear, self.layers[0])
 
     @property
     def _others(self) -> list[nn.Module]:
         return list(self.layers)[1:]
 
 
-class _StackedLinear(nn.Module):
-    """``E`` linear layers, ``(E, rows, in) -> (E, rows, out)``."""
-
-    def __init__(self, num_critics: int, num_in: int, num_out: int, **factory: Any) -> None:
-        super().__init__()
-        self.weight = nn.Parameter(torch.empty(num_critics, num_in, num_out, **factory))
-        self.bias = nn.Parameter(torch.zeros(num_critics, 1, num_out, **factory))
-        _truncated_normal(self.weight, num_in)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return torch.baddbmm(self.bias, x, self.weight)
-
-
 def _linear(num_in: int, num_out: int, **factory: Any) -> nn.Linear:
     layer = nn.Linear(num_in, num_out, **factory)
     nn.init.zeros_(layer.bias)
-    _truncated_normal(layer.weight, num_in)
+    truncated_normal_(layer.weight, num_in)
     return layer
-
-
-def _truncated_normal(weight: Tensor, num_in: int) -> None:
-    std = num_in**-0.5
-    nn.init.trunc_normal_(weight, std=std, a=-2 * std, b=2 * std)
 
 
 def _check_sizes(network: nn.Module, *sizes: int) -> None:
