@@ -30,9 +30,18 @@ ALLOWED = {
     "stacked": set(),
     "schedule": {"checks", "functional"},
     "chain": {"checks", "functional", "schedule"},
+    "chain_policy": {"checks", "chain"},
     "critic": {"checks", "functional", "stacked"},
     "custom_critic": {"functional", "critic"},
-    "actor": {"checks", "functional", "schedule", "chain", "critic", "custom_critic"},
+    "actor": {
+        "checks",
+        "functional",
+        "schedule",
+        "chain",
+        "chain_policy",
+        "critic",
+        "custom_critic",
+    },
     "td_loss": {"checks", "functional"},
     "loss": {
         "checks",
@@ -48,7 +57,15 @@ ALLOWED = {
 }
 # What each room may import besides itself.
 ROOMS = {
-    "baselines": {"checks", "functional", "stacked", "schedule", "chain", "td_loss"},
+    "baselines": {
+        "checks",
+        "functional",
+        "stacked",
+        "schedule",
+        "chain",
+        "chain_policy",
+        "td_loss",
+    },
     "replay": {"checks", "errors"},
     "offline": {"checks", "errors", "replay"},
     "training": {"checks", "errors", "replay"},

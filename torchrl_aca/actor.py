@@ -3,28 +3,22 @@
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase, dispatch
+from tensordict.nn import dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torchrl.data import Composite, TensorSpec
+from torchrl.data import TensorSpec
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from torchrl_aca import chain
 from torchrl_aca import functional as F
-from torchrl_aca.checks import (
-    action_spec,
-    check_above,
-    check_at_least,
-    check_choice,
-    first_parameter,
-)
+from torchrl_aca.chain_policy import ChainPolicy
+from torchrl_aca.checks import check_above, check_at_least, check_choice, first_parameter
 from torchrl_aca.critic import NoiseLevelCriticBase
 from torchrl_aca.custom_critic import as_noise_level_critic
 from torchrl_aca.schedule import NoiseSchedule
@@ -32,7 +26,7 @@ from torchrl_aca.schedule import NoiseSchedule
 __all__ = ["CriticGuidedDenoisingActor"]
 
 
-class CriticGuidedDenoisingActor(TensorDictModuleBase):
+class CriticGuidedDenoisingActor(ChainPolicy):
     """Samples actions by denoising Gaussian noise along the critic's gradient (Definition 1).
 
     For each state, ``num_candidates`` chains run from ``a_T ~ N(0, I)`` to ``a_0``; the candidate
@@ -102,9 +96,6 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         torch.Size([3, 6])
     """
 
-    center: Tensor
-    half_range: Tensor
-    fixed_noise: Tensor
     guidance_weight: Tensor
 
     def __init__(
@@ -132,12 +123,9 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         out_keys: Sequence[NestedKey] = ("action",),
     ) -> None:
         super().__init__()
-        check_at_least(1, num_candidates=num_candidates, tile_rows=tile_rows)
-        check_at_least(0, guidance_weight=guidance_weight, exploration_noise=exploration_noise)
-        check_at_least(0, clip_denoised=clip_denoised)
-        check_above(0, alpha_init=alpha_init, langevin_step_size=langevin_step_size)
+        check_at_least(0, guidance_weight=guidance_weight, clip_denoised=clip_denoised)
+        check_above(0, langevin_step_size=langevin_step_size)
         check_choice(("denoising", "langevin"), sampler=sampler)
-        check_choice(("fixed", "fresh"), deterministic_draws=deterministic_draws)
         self.critic: NoiseLevelCriticBase = as_noise_level_critic(critic)
         if getattr(critic, "num_steps", schedule.num_steps) != schedule.num_steps:
             raise ValueError(
@@ -150,35 +138,25 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         self.inference_levels = _levels(schedule.num_steps, num_inference_steps, inference_levels)
         self.num_inference_steps = len(self.inference_levels)
         self.chain_schedule = self.schedule.restrict(self.inference_levels)
-        self.num_candidates = num_candidates
         self.normalize_gradient = normalize_gradient
         self.clip_denoised = clip_denoised
         self.sampler = sampler
         self.langevin_step_size = langevin_step_size
-        self.exploration_noise = exploration_noise
-        self.deterministic_draws = deterministic_draws
-        self.clip_action = clip_action
-        self._run = chain.StepRunner(compile_step)
-        self.tile_rows = tile_rows
-        self.in_keys = list(in_keys) if in_keys is not None else list(self.critic.observation_keys)
-        self.out_keys = list(out_keys)
-
-        self.log_alpha = nn.Parameter(anchor.new_tensor(math.log(alpha_init)))
-        action_dim = action_dim or getattr(critic, "action_dim", None)
-        leaf = action_spec(spec, self.out_keys[0], action_dim)
-        self.spec = Composite({self.out_keys[0]: leaf}).to(anchor.device)
-        self.action_dim = leaf.shape[-1]
-        low, high = torch.full(leaf.shape, -1.0), torch.full(leaf.shape, 1.0)
-        if spec is not None:
-            low, high = leaf.space.low, leaf.space.high
-        shape = (self.num_inference_steps + 1, num_candidates, self.action_dim)
-        constants = {
-            "center": (high + low) / 2,
-            "half_range": (high - low) / 2,
-            "fixed_noise": torch.randn(shape, generator=torch.Generator().manual_seed(0)),
-        }
-        for name, value in constants.items():
-            self.register_buffer(name, value.to(anchor), persistent=False)
+        self._init_policy(
+            anchor,
+            self.num_inference_steps,
+            spec=spec,
+            action_dim=action_dim or getattr(critic, "action_dim", None),
+            num_candidates=num_candidates,
+            exploration_noise=exploration_noise,
+            alpha_init=alpha_init,
+            deterministic_draws=deterministic_draws,
+            clip_action=clip_action,
+            compile_step=compile_step,
+            tile_rows=tile_rows,
+            in_keys=self.critic.observation_keys if in_keys is None else in_keys,
+            out_keys=out_keys,
+        )
         weight = torch.tensor(guidance_weight, dtype=torch.float64, device=anchor.device)
         self.register_buffer("guidance_weight", weight)
 
@@ -196,16 +174,6 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         super()._apply(fn, recurse)
         self.guidance_weight = weight.to(self.guidance_weight.device)
         return self
-
-    # --- units ------------------------------------------------------------------------------------
-
-    def to_env(self, action: Tensor) -> Tensor:
-        """Critic units, [-1, 1], to the env's units."""
-        return self.center + self.half_range * action
-
-    def from_env(self, action: Tensor) -> Tensor:
-        """The env's units to critic units, [-1, 1]."""
-        return (action.to(self.center.dtype) - self.center) / self.half_range
 
     # --- the candidates ---------------------------------------------------------------------------
 
@@ -258,15 +226,6 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
         batch = candidates.shape[1:-1]
         rows = candidates.reshape(candidates.shape[0], -1, candidates.shape[-1])
         return self._select(self.encode(observation, batch), rows).reshape(candidates.shape[1:])
-
-    def explore(self, action: Tensor, draw: Tensor) -> Tensor:
-        """The action with exploration noise, in critic units.
-
-        Args:
-            action: actions in critic units, shape ``(*batch, A)``.
-            draw: standard normal draws of the same shape.
-        """
-        return action + self.exploration_noise * self.log_alpha.exp() * draw
 
     def _from_noise(
         self, observation: Tensor | Sequence[Tensor], noise: Tensor, keep_path: bool
@@ -342,30 +301,11 @@ class CriticGuidedDenoisingActor(TensorDictModuleBase):
             ValueError: if ``num_candidates`` is below 1, or exceeds that of the fixed draws.
         """
         batch = torch.Size(batch)
-        num_rows = batch.numel()
-        num_chains = self.num_candidates if num_candidates is None else num_candidates
-        check_at_least(1, num_candidates=num_chains)
         features = self.encode(observation, batch)
-        draws = self._draws(num_chains, num_rows, deterministic)
+        draws = self.draws(batch.numel(), num_candidates, deterministic)
         action = self._select(features, self._chains(features, draws[:-1]))
-        if not deterministic:
-            action = self.explore(action, draws[-1, 0])
-        if self.clip_action:
-            action = action.clamp(-1, 1)
+        action = self.explore(action, draws[-1, 0])
         return self.to_env(action).reshape(*batch, self.action_dim)
-
-    def _draws(self, num_chains: int, num_rows: int, deterministic: bool) -> Tensor:
-        """All draws of a call, ``(S + 2, N, rows, A)``: chain noise, then exploration noise."""
-        if not deterministic or self.deterministic_draws == "fresh":
-            shape = (self.num_inference_steps + 2, num_chains, num_rows, self.action_dim)
-            return torch.randn(shape, dtype=self.center.dtype, device=self.center.device)
-        if num_chains > self.fixed_noise.shape[1]:
-            raise ValueError(
-                f"A deterministic call has draws for {self.fixed_noise.shape[1]} candidates, got "
-                f"num_candidates={num_chains}. Build the actor with that many."
-            )
-        draws = self.fixed_noise[:, :num_chains, None].expand(-1, -1, num_rows, -1)
-        return torch.cat([draws, torch.zeros_like(draws[:1])])
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -3,34 +3,28 @@
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Sequence
 from functools import partial
 from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase, dispatch
+from tensordict.nn import dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torchrl.data import Composite, TensorSpec
+from torchrl.data import TensorSpec
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from torchrl_aca import chain
 from torchrl_aca import functional as F
-from torchrl_aca.checks import (
-    action_spec,
-    check_above,
-    check_at_least,
-    check_choice,
-    first_parameter,
-)
+from torchrl_aca.chain_policy import ChainPolicy
+from torchrl_aca.checks import check_above, check_at_least, check_choice, first_parameter
 from torchrl_aca.schedule import NoiseSchedule
 
 __all__ = ["DiffusionPolicy"]
 
 
-class DiffusionPolicy(TensorDictModuleBase):
+class DiffusionPolicy(ChainPolicy):
     """Samples actions by a reverse chain whose noise, or score, a network predicts.
 
     For each state, ``num_candidates`` chains run from ``a_T ~ N(0, initial_scale^2 I)``; the
@@ -92,9 +86,6 @@ class DiffusionPolicy(TensorDictModuleBase):
         torch.Size([3, 6])
     """
 
-    center: Tensor
-    half_range: Tensor
-    fixed_noise: Tensor
     step_sizes: Tensor | None
     network: Any
     critic: Any
@@ -123,12 +114,9 @@ class DiffusionPolicy(TensorDictModuleBase):
         out_keys: Sequence[NestedKey] = ("action",),
     ) -> None:
         super().__init__()
-        check_at_least(1, num_candidates=num_candidates, tile_rows=tile_rows)
-        check_at_least(0, exploration_noise=exploration_noise, clip_denoised=clip_denoised)
-        check_at_least(0, clip_step=clip_step)
-        check_above(0, alpha_init=alpha_init, initial_scale=initial_scale)
+        check_at_least(0, clip_denoised=clip_denoised, clip_step=clip_step)
+        check_above(0, initial_scale=initial_scale)
         check_choice(("posterior", "beta"), variance=variance)
-        check_choice(("fixed", "fresh"), deterministic_draws=deterministic_draws)
         anchor = first_parameter(network)
         self.network, self.critic = network, critic
         step_sizes = None
@@ -142,48 +130,30 @@ class DiffusionPolicy(TensorDictModuleBase):
             check_above(0, least_step_size=min(schedule, default=0.0))
         self.register_buffer("step_sizes", step_sizes, persistent=False)
         _check_fit(network, critic, self.num_steps, num_candidates)
-        self.num_candidates = num_candidates
         self.initial_scale = initial_scale
         self.clip_denoised, self.clip_step = clip_denoised, clip_step
         self.variance = variance
-        self.exploration_noise = exploration_noise
-        self.clip_action = clip_action
-        self.deterministic_draws = deterministic_draws
-        self._run = chain.StepRunner(compile_step)
-        self.tile_rows = tile_rows
-        self.in_keys, self.out_keys = list(in_keys), list(out_keys)
-        self.log_alpha = nn.Parameter(anchor.new_tensor(math.log(alpha_init)))
-        action_dim = action_dim or getattr(network, "action_dim", None)
-        leaf = action_spec(spec, self.out_keys[0], action_dim)
-        self.spec = Composite({self.out_keys[0]: leaf}).to(anchor.device)
-        self.action_dim = leaf.shape[-1]
-        low, high = torch.full(leaf.shape, -1.0), torch.full(leaf.shape, 1.0)
-        if spec is not None:
-            low, high = leaf.space.low, leaf.space.high
-        shape = (self.num_steps + 1, num_candidates, self.action_dim)
-        constants = {
-            "center": (high + low) / 2,
-            "half_range": (high - low) / 2,
-            "fixed_noise": torch.randn(shape, generator=torch.Generator().manual_seed(0)),
-        }
-        for name, value in constants.items():
-            self.register_buffer(name, value.to(anchor), persistent=False)
+        self._init_policy(
+            anchor,
+            self.num_steps,
+            spec=spec,
+            action_dim=action_dim or getattr(network, "action_dim", None),
+            num_candidates=num_candidates,
+            exploration_noise=exploration_noise,
+            alpha_init=alpha_init,
+            deterministic_draws=deterministic_draws,
+            clip_action=clip_action,
+            compile_step=compile_step,
+            tile_rows=tile_rows,
+            in_keys=in_keys,
+            out_keys=out_keys,
+        )
 
     def on(self, network: nn.Module) -> DiffusionPolicy:
         """The same policy with another network: critics and ``alpha`` stay shared."""
         other = copy.copy(self)
         other._modules = {**self._modules, "network": network}
         return other
-
-    # --- units ------------------------------------------------------------------------------------
-
-    def to_env(self, action: Tensor) -> Tensor:
-        """[-1, 1] to the env's units."""
-        return self.center + self.half_range * action
-
-    def from_env(self, action: Tensor) -> Tensor:
-        """The env's units to [-1, 1]."""
-        return (action.to(self.center.dtype) - self.center) / self.half_range
 
     # --- the candidates ---------------------------------------------------------------------------
 
@@ -227,8 +197,8 @@ class DiffusionPolicy(TensorDictModuleBase):
         return self.network(features, action, level)
 
     def _score(self, features: Any, action: Tensor) -> Tensor:
-        clean = torch.ones((), dtype=torch.long, device=action.device)
-        return self.network(features, action, clean)
+        level = torch.ones((), dtype=torch.long, device=action.device)  # it reads none
+        return self.network(features, action, level)
 
     @torch.no_grad()
     def values(self, observation: Tensor, candidates: Tensor) -> Tensor:
@@ -239,17 +209,6 @@ class DiffusionPolicy(TensorDictModuleBase):
 
     def _values(self, features: Any, candidates: Tensor) -> Tensor:
         return self.critic.evaluate(features, candidates)
-
-    def explore(self, action: Tensor, draw: Tensor) -> Tensor:
-        """The action with exploration noise, and clipped if ``clip_action``, in [-1, 1] units.
-
-        Args:
-            action: actions of shape ``(*batch, A)``.
-            draw: standard normal draws of the same shape.
-        """
-        # Detached: where a loss differentiates the action, it is not by alpha.
-        action = action + self.exploration_noise * self.log_alpha.detach().exp() * draw
-        return action.clamp(-1, 1) if self.clip_action else action
 
     # --- acting -----------------------------------------------------------------------------------
 
@@ -277,30 +236,6 @@ class DiffusionPolicy(TensorDictModuleBase):
             action = F.select_best(candidates, self.values(rows, candidates))
         action = self.explore(action, draws[-1, 0])
         return self.to_env(action).reshape(*batch, self.action_dim)
-
-    def draws(
-        self, num_rows: int, num_candidates: int | None = None, deterministic: bool = False
-    ) -> Tensor:
-        """All draws of a call, ``(T + 2, N, rows, A)``: those of the chain, then of exploration.
-
-        Raises:
-            ValueError: if ``num_candidates`` is below 1, or exceeds that of the fixed draws.
-        """
-        num_chains = self.num_candidates if num_candidates is None else num_candidates
-        check_at_least(1, num_candidates=num_chains)
-        if not deterministic or self.deterministic_draws == "fresh":
-            shape = (self.num_steps + 2, num_chains, num_rows, self.action_dim)
-            draws = torch.randn(shape, dtype=self.center.dtype, device=self.center.device)
-            if deterministic:
-                draws[-1] = 0.0
-            return draws
-        if num_chains > self.fixed_noise.shape[1]:
-            raise ValueError(
-                f"A deterministic call has draws for {self.fixed_noise.shape[1]} candidates, got "
-                f"num_candidates={num_chains}. Build the policy with that many."
-            )
-        draws = self.fixed_noise[:, :num_chains, None].expand(-1, -1, num_rows, -1)
-        return torch.cat([draws, torch.zeros_like(draws[:1])])
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
