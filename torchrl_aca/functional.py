@@ -159,21 +159,25 @@ def mish(x: Tensor) -> Tensor:
     PyTorch's own takes an exponential, a logarithm and a hyperbolic tangent, and a compiler follows
     it there; this takes one exponential (:func:`mish_and_slope`). It is differentiable once.
     """
-    return cast(Tensor, _Mish.apply(x))
+    return cast(Tensor, _Mish.apply(x)[0])
 
 
 class _Mish(torch.autograd.Function):
-    """Mish by :func:`mish_and_slope`."""
+    """Mish and its slope by :func:`mish_and_slope`; in this form ``torch.func`` knows it too."""
 
     @staticmethod
-    def forward(ctx: Any, x: Tensor) -> Tensor:
-        value, slope = mish_and_slope(x)
+    def forward(x: Tensor) -> tuple[Tensor, Tensor]:
+        return mish_and_slope(x)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor], output: tuple[Tensor, Tensor]) -> None:
+        slope = output[1]
+        ctx.mark_non_differentiable(slope)
         ctx.save_for_backward(slope)
-        return value
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+    def backward(ctx: Any, gradient: Tensor, _: Any) -> Tensor:
         (slope,) = ctx.saved_tensors
         return gradient * slope
 
