@@ -10,19 +10,16 @@ from __future__ import annotations
 
 import argparse
 import shutil
-import statistics
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from tensordict import TensorDict
-from torchrl.envs import EnvBase
+from torch.utils.benchmark import Timer
 
-from recipe import configure, make_recipe_agent
+from recipe import configure, make_recipe_agent, random_batch
 from torchrl_aca.training.envs import make_vector_env
 from torchrl_aca.training.report import versions
 
@@ -49,49 +46,22 @@ class Case:
         return [*sizes, *VARIANTS[self.variant]]
 
 
-def seconds_of(call: Callable[[], object], device: torch.device, rounds: int) -> float:
-    """The median time of a call, the device's work included."""
-    times = []
-    for _ in range(rounds):
-        _wait(device)
-        start = time.perf_counter()
-        call()
-        _wait(device)
-        times.append(time.perf_counter() - start)
-    return statistics.median(times)
+def seconds_of(call: Callable[[], object], seconds: float) -> float:
+    """The median time of a call, the device's work included, from calls in so many seconds."""
+    timer = Timer("call()", globals={"call": call}, num_threads=torch.get_num_threads())
+    return timer.blocked_autorange(min_run_time=seconds).median
 
 
-def _wait(device: torch.device) -> None:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-
-
-def random_batch(env: EnvBase, size: int) -> TensorDict:
-    """Transitions of the environment's sizes."""
-    observation_dim = env.observation_spec["observation"].shape[-1]
-    action_dim = env.action_spec_unbatched.shape[-1]
-    flag = torch.zeros(size, 1, dtype=torch.bool)
-    return TensorDict(
-        observation=torch.randn(size, observation_dim),
-        action=torch.rand(size, action_dim) * 2 - 1,
-        next=TensorDict(
-            observation=torch.randn(size, observation_dim),
-            reward=torch.randn(size, 1),
-            done=flag,
-            terminated=flag,
-            batch_size=[size],
-        ),
-        batch_size=[size],
-    )
-
-
-def measure(case: Case, device: torch.device, rounds: int) -> tuple[float, float]:
+def measure(case: Case, device: torch.device, seconds: float) -> tuple[float, float]:
     """Seconds of acting in five environments, and of an update, after compiling and capturing."""
     torch._dynamo.reset()
     cfg = configure(*case.overrides())
     env = make_vector_env(cfg.env.name, cfg.collector.num_envs, 0)
     agent = make_recipe_agent(cfg, env, device)
-    batch = random_batch(env, cfg.optim.batch_size).to(device)
+    sizes = (
+        spec.shape[-1] for spec in (env.observation_spec["observation"], env.action_spec_unbatched)
+    )
+    batch = random_batch(*sizes, cfg.optim.batch_size).to(device)
     state = env.reset().to(device)
 
     @torch.no_grad()
@@ -101,17 +71,17 @@ def measure(case: Case, device: torch.device, rounds: int) -> tuple[float, float
     for _ in range(12):  # six updates of each kind: one more than a graph's warm-up
         act()
         agent.update(batch)
-    return seconds_of(act, device, rounds), seconds_of(lambda: agent.update(batch), device, rounds)
+    return seconds_of(act, seconds), seconds_of(lambda: agent.update(batch), seconds)
 
 
-def table(device: torch.device, cases: Sequence[Case], rounds: int) -> Iterator[str]:
+def table(device: torch.device, cases: Sequence[Case], seconds: float) -> Iterator[str]:
     """Yields the lines of the speed table as they are measured; a case that fails is told."""
     yield "| task | N of the target | variant | acting, 5 x 32 | update | updates/s |"
     yield "|---|--:|---|--:|--:|--:|"
     for case in cases:
         start = f"| {case.task} | {case.num_candidates} | {case.variant} |"
         try:
-            acting, update = measure(case, device, rounds)
+            acting, update = measure(case, device, seconds)
         except Exception as error:  # a defect of one variant must not hide the others
             yield f"{start} failed: {type(error).__name__}: {str(error).splitlines()[0]} | | |"
             continue
@@ -153,7 +123,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--candidates", nargs="+", type=int, default=[1, 4, 32])
     parser.add_argument("--tasks", nargs="+", default=TASKS)
     parser.add_argument("--variants", nargs="+", default=VARIANTS)
-    parser.add_argument("--rounds", type=int, default=30)
+    parser.add_argument("--seconds", type=float, default=2.0, help="of each measurement")
     parser.add_argument("--updates", type=int, default=10000, help="of the training; 0: none")
     parser.add_argument("--no-tests", action="store_true")
     args = parser.parse_args(arguments)
@@ -172,7 +142,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with open(args.out / "speed.md", "w") as file:
         lines = ["# Speed on a GPU", "", "Written by `make gpu`: medians.", "", *facts, ""]
         file.write("\n".join(lines) + "\n")
-        for line in table(device, cases, args.rounds):
+        for line in table(device, cases, args.seconds):
             print(line, flush=True)
             file.write(line + "\n")
             file.flush()

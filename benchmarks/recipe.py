@@ -9,6 +9,7 @@ from pathlib import Path
 
 import hydra
 import torch
+from tensordict import TensorDict
 from torchrl.envs import EnvBase
 
 from agents import configured, make_agent
@@ -27,3 +28,21 @@ def configure(*overrides: str, name: str = "online_mujoco") -> RunConfig:
 def make_recipe_agent(cfg: RunConfig, env: EnvBase, device: str | torch.device = "cpu") -> Agent:
     """The agent of that configuration."""
     return make_agent(cfg, env, torch.device(device))
+
+
+def random_batch(observation_dim: int, action_dim: int, size: int) -> TensorDict:
+    """Transitions of such sizes."""
+    ended = torch.zeros(size, 1, dtype=torch.bool)
+    following = TensorDict(
+        observation=torch.randn(size, observation_dim),
+        reward=torch.randn(size, 1),
+        done=ended,
+        terminated=ended.clone(),
+        batch_size=[size],
+    )
+    return TensorDict(
+        observation=torch.randn(size, observation_dim),
+        action=torch.rand(size, action_dim) * 2 - 1,
+        next=following,
+        batch_size=[size],
+    )

@@ -12,7 +12,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from recipe import configure, make_recipe_agent
+from recipe import configure, make_recipe_agent, random_batch
 from torchrl_aca import CriticGuidedDenoisingActor, NoiseLevelCritic, NoiseSchedule
 from torchrl_aca.training.envs import make_vector_env
 from yardstick import PlainAgent
@@ -46,21 +46,7 @@ def make_actor(
 
 
 def make_batch(size: str) -> TensorDict:
-    observation_dim, action_dim = SIZES[size]
-    ended = torch.zeros(BATCH, 1, dtype=torch.bool)
-    following = TensorDict(
-        observation=torch.randn(BATCH, observation_dim),
-        reward=torch.randn(BATCH, 1),
-        done=ended,
-        terminated=ended.clone(),
-        batch_size=[BATCH],
-    )
-    return TensorDict(
-        observation=torch.randn(BATCH, observation_dim),
-        action=torch.rand(BATCH, action_dim) * 2 - 1,
-        next=following,
-        batch_size=[BATCH],
-    )
+    return random_batch(*SIZES[size], BATCH)
 
 
 def measure(benchmark, call, rows: int, case: str, variant: str, work: float) -> None:

@@ -31,14 +31,14 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
 from torchrl import logger as torchrl_logger
-from torchrl.collectors import Collector
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MLP, ValueOperator
 from tqdm import tqdm
 
 from bandit import rivals, tables
+from bandit.collect import make_collector
 from bandit.config import RIVALS, BanditConfig, variants
-from bandit.env import TwoDBandit, mode_shares, reward
+from bandit.env import mode_shares, reward
 from bandit.figures import draw_figures
 from bandit.tables import Row
 from torchrl_aca import ACALoss, CriticGuidedDenoisingActor, NoiseLevelCritic
@@ -90,16 +90,8 @@ def train(cfg: BanditConfig, method: str, seed: int) -> CriticGuidedDenoisingAct
     optimizer = torch.optim.Adam(actor.critic.parameters(), lr=cfg.optim.lr)
     num_updates = collection.frames // collection.frames_per_batch * cfg.optim.updates_per_batch
     scheduler = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, num_updates)
-    uniform = cfg.data == "uniform"
     buffer = make_replay_buffer(collection.frames, cfg.optim.batch_size)
-    collector = Collector(
-        TwoDBandit(collection.frames_per_batch, collection.half_width),
-        actor,
-        frames_per_batch=collection.frames_per_batch,
-        total_frames=collection.frames,
-        init_random_frames=collection.frames if uniform else collection.warmup_frames,
-        auto_register_policy_transforms=False,
-    )
+    collector = make_collector(cfg, actor)
     for data in collector:
         buffer.extend(transitions(data))
         for _ in range(cfg.optim.updates_per_batch):

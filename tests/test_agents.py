@@ -22,6 +22,7 @@ from recipe_cases import (
     without_time,
 )
 from torchrl_aca.errors import RunError
+from torchrl_aca.training.checkpoint import list_checkpoints, updates_of
 from torchrl_aca.training.envs import make_vector_env
 from torchrl_aca.training.resume import resumed_config
 
@@ -160,6 +161,12 @@ def test_the_policy_of_a_run_can_be_taken_out_of_it(unbroken):
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
         action = policy(data.clone())["action"]
     assert action.shape == (5, 3) and action.isfinite().all()
+    first = updates_of(list_checkpoints(run_dir / "checkpoints")[0])
+    earlier, _ = load_policy(run_dir, updates=first)
+    pairs = zip(earlier.parameters(), policy.parameters(), strict=True)
+    assert any(not torch.equal(*pair) for pair in pairs)
+    with pytest.raises(RunError, match="expected a checkpoint of 7 updates, found those of"):
+        load_policy(run_dir, updates=7)
     with pytest.raises(RunError, match="expected a run directory with checkpoints"):
         load_policy(run_dir.parent)
 

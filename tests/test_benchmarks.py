@@ -76,7 +76,7 @@ def test_the_report_tells_what_the_loop_costs():
 
 def test_the_gpu_command_times_what_works_and_tells_what_does_not(tmp_path, monkeypatch):
     torch.set_num_threads(1)
-    arguments = ["--device", "cpu", "--no-tests", "--updates", "0", "--rounds", "1"]
+    arguments = ["--device", "cpu", "--no-tests", "--updates", "0", "--seconds", "0.1"]
     cases = ["--tasks", "inverted_pendulum", "--candidates", "1", "--variants", "eager", "broken"]
     monkeypatch.setitem(gpu.VARIANTS, "broken", ["device=nonsense"])
     assert gpu.main([*arguments, *cases, "--out", str(tmp_path)]) == 0

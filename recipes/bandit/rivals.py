@@ -6,11 +6,10 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torchrl.collectors import Collector
 from torchrl.objectives import SoftUpdate
 
+from bandit.collect import make_collector
 from bandit.config import BanditConfig
-from bandit.env import TwoDBandit
 from torchrl_aca.baselines import (
     DACERLoss,
     DiffusionPolicy,
@@ -57,9 +56,7 @@ def make_loss(cfg: BanditConfig, method: str) -> DiffusionPolicyLoss:
         deterministic_draws="fresh",
         **chain,
     )
-    loss = LOSSES[method](policy, reward_scale=1.0, **settings.loss, **settings.chosen)
-    SoftUpdate(loss, tau=settings.tau)
-    return loss
+    return LOSSES[method](policy, reward_scale=1.0, **settings.loss, **settings.chosen)
 
 
 def train(cfg: BanditConfig, method: str, seed: int) -> DiffusionPolicy:
@@ -87,15 +84,7 @@ def train(cfg: BanditConfig, method: str, seed: int) -> DiffusionPolicy:
         losses[name].backward()
         optimizers[name].step()
 
-    uniform = cfg.data == "uniform"
-    collector = Collector(
-        TwoDBandit(collection.frames_per_batch, collection.half_width),
-        loss.actor_network,
-        frames_per_batch=collection.frames_per_batch,
-        total_frames=collection.frames,
-        init_random_frames=collection.frames if uniform else collection.warmup_frames,
-        auto_register_policy_transforms=False,
-    )
+    collector = make_collector(cfg, loss.actor_network)
     for data in collector:
         buffer.extend(transitions(data, rewritten=best))
         for update in range(settings.updates_per_batch):

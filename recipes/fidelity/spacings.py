@@ -11,13 +11,8 @@ from torchrl_aca import NoiseSchedule
 from torchrl_aca.chain import inference_levels
 
 
-def even(schedule: NoiseSchedule, grid: Tensor) -> Tensor:
-    """Equal steps of the level."""
-    return power(1)(schedule, grid)
-
-
 def power(exponent: float) -> Callable[[NoiseSchedule, Tensor], Tensor]:
-    """Steps that grow as a power of their number; 2 is the quadratic spacing of DDIM's code."""
+    """Steps that grow as a power of their number; 1 is even, 2 the quadratic one of DDIM's code."""
     return lambda schedule, grid: 1 + (schedule.num_steps - 1) * grid**exponent
 
 
@@ -41,7 +36,7 @@ def low(schedule: NoiseSchedule, grid: Tensor) -> Tensor:
 
 
 SPACINGS: dict[str, Callable[[NoiseSchedule, Tensor], Tensor]] = {
-    "even": even,
+    "even": power(1),
     "log SNR": log_snr,
     "quadratic": power(2),
     "geometric": geometric,
