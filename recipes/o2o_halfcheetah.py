@@ -79,8 +79,8 @@ def train(cfg: DictConfig, checkpoint: dict[str, Any] | None = None) -> Path:
     device = make_device(cfg)
     seed_everything(cfg.seed)
 
-    env = make_vector_env(cfg.env.name, cfg.collector.num_envs, cfg.seed)
-    eval_env = make_eval_env(cfg.env.name, cfg.eval)
+    env = make_vector_env(cfg.env, cfg.collector.num_envs, cfg.seed)
+    eval_env = make_eval_env(cfg.env, cfg.eval)
     agent = make_agent(cfg, env, device)
     require_offline_phase(cfg, agent)
     dataset, scores = load_offline_data(cfg, env), task_scores(cfg)

@@ -38,8 +38,8 @@ def train(cfg: DictConfig, checkpoint: dict[str, Any] | None = None) -> Path:
     device = make_device(cfg)
     seed_everything(cfg.seed)
 
-    env = make_vector_env(cfg.env.name, cfg.collector.num_envs, cfg.seed)
-    eval_env = make_eval_env(cfg.env.name, cfg.eval)
+    env = make_vector_env(cfg.env, cfg.collector.num_envs, cfg.seed)
+    eval_env = make_eval_env(cfg.env, cfg.eval)
     agent = make_agent(cfg, env, device)
     buffer = make_replay_buffer(cfg.buffer.capacity, cfg.optim.batch_size)
     collection = Collection(env, agent.policy, cfg.collector, device)

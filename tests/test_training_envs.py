@@ -10,8 +10,11 @@ from torchrl.collectors import Collector
 from torchrl.modules import RandomPolicy
 
 from torchrl_aca.errors import RunError
+from torchrl_aca.training.collection import Collection
+from torchrl_aca.training.config import Collector as CollectorSettings
+from torchrl_aca.training.config import Env
+from torchrl_aca.training.env_state import EnvState
 from torchrl_aca.training.envs import (
-    EnvState,
     _quiet_construction,
     make_env,
     make_vector_env,
@@ -154,3 +157,110 @@ def test_unsuitable_action_spaces_are_refused(space, message):
 def test_unknown_environment_is_named():
     with pytest.raises(RunError, match="NoSuchTask-v0.*cannot be made"):
         make_env("NoSuchTask-v0")
+
+
+class Parts(gym.Env):
+    """An observation of several parts, with a keyword of its own."""
+
+    observation_space = gym.spaces.Dict(
+        velocity=gym.spaces.Box(-1, 1, (2,)),
+        angle=gym.spaces.Box(-1, 1, (), dtype=np.float64),
+        mode=gym.spaces.Discrete(3),
+    )
+    action_space = gym.spaces.Box(-1, 1, (1,))
+
+    def __init__(self, reward: float = 1.0) -> None:
+        self.reward = reward
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return {"velocity": np.float32([0.1, 0.2]), "angle": np.array(0.3), "mode": 1}, {}
+
+    def step(self, action):
+        return self.reset()[0], self.reward, False, False, {}
+
+
+@pytest.fixture
+def parts_env():
+    gym.register("Parts-v0", Parts, max_episode_steps=3, disable_env_checker=True)
+    yield "Parts-v0"
+    del gym.registry["Parts-v0"]
+
+
+def test_an_observation_of_several_parts_becomes_one_vector(parts_env):
+    env = make_vector_env(parts_env, num_envs=2, seed=0)
+    observation = env.reset()["observation"]
+    keys = list(Parts.observation_space)
+    flat = {"velocity": [0.1, 0.2], "angle": [0.3], "mode": [0.0, 1.0, 0.0]}
+    expected = torch.tensor([number for key in keys for number in flat[key]])
+    assert torch.equal(observation, expected.expand(2, 6))
+    assert observation.dtype == torch.float32
+    for _ in range(3):
+        data = env.rand_step(env.reset())
+    assert data["next", "observation"].shape == (2, 6)
+
+
+def test_keywords_and_wrappers_reach_the_environment(parts_env):
+    halve = {"name": f"{__name__}:Halve"}
+    clip = {"name": "ClipReward", "min_reward": 0.0, "max_reward": 0.75}
+    for wrappers, reward in (
+        ([], 2.0),
+        ([clip], 0.75),
+        ([clip, halve], 0.375),
+        ([halve, clip], 0.75),
+    ):
+        task = Env.model_validate(
+            {"name": parts_env, "kwargs": {"reward": 2.0}, "wrappers": wrappers}
+        )
+        env = make_vector_env(task, num_envs=1, seed=0)
+        assert env.rand_step(env.reset())["next", "reward"].item() == reward
+
+
+class Halve(gym.RewardWrapper):
+    def reward(self, reward):
+        return reward / 2
+
+
+@pytest.mark.parametrize(
+    ("section", "message"),
+    [
+        ({"kwargs": {"colour": "red"}}, "colour.*env.kwargs=.*must be what it takes"),
+        ({"wrappers": [{"name": "NoSuchWrapper"}]}, "NoSuchWrapper cannot be put around"),
+        ({"wrappers": [{"name": "ClipReward", "low": 0}]}, "ClipReward.*keyword argument 'low'"),
+        ({"wrappers": [{"name": "no_module:Wrapper"}]}, "No module named 'no_module'"),
+    ],
+)
+def test_wrong_keywords_and_wrappers_are_told(parts_env, section, message):
+    with pytest.raises(RunError, match=message):
+        make_env(Env.model_validate({"name": parts_env, **section}))
+
+
+@pytest.mark.parametrize(
+    ("name", "wrappers", "exact"),
+    [
+        ("Hopper-v4", [], True),
+        ("Pendulum-v1", [], False),
+        ("Hopper-v4", [{"name": "NormalizeReward"}], False),
+    ],
+)
+def test_an_episode_goes_on_only_where_its_whole_state_is_known(name, wrappers, exact):
+    env = make_vector_env(Env.model_validate({"name": name, "wrappers": wrappers}), 1, seed=0)
+    settings = CollectorSettings(num_envs=1, frames_per_batch=4, warmup_frames=4, warmup="random")
+    collection = Collection(env, RandomPolicy(env.action_spec), settings)
+    assert (collection.why_unsavable() is None) == exact
+    next(iter(collection))
+    state = collection.state_dict()
+    begun = collection.episodes.returns.clone()
+    assert begun.item() != 0
+    collection.load_state_dict(state)
+    assert collection.episodes.returns.equal(begun if exact else torch.zeros_like(begun))
+    collection.close()
+
+
+def test_deepmind_control_comes_through_shimmy():
+    pytest.importorskip("shimmy", reason="needs the extra dmc")
+    pytest.importorskip("dm_control", reason="needs the extra dmc")
+    env = make_vector_env("shimmy:dm_control/walker-walk-v0", num_envs=2, seed=0, max_steps=3)
+    data = env.rollout(5)
+    assert data["observation"].shape == (2, 3, 24)
+    assert data["next", "truncated"][:, -1].all() and not data["next", "terminated"].any()

@@ -140,7 +140,7 @@ def policy_of(
     stored = OmegaConf.create(checkpoint["config"])
     recipe_keys = {*RunConfig.model_fields, *AGENTS[stored.algo.name].sections}
     cfg = configured(OmegaConf.masked_copy(stored, [k for k in stored if k in recipe_keys]))
-    env = make_vector_env(cfg.env.name, 1, 0)
+    env = make_vector_env(cfg.env, 1, 0)
     agent = make_agent(cfg, env, torch.device(device))
     restore({"agent.loss": agent.state["loss"]}, checkpoint["parts"])
     return agent.policy, cfg

@@ -17,13 +17,19 @@ from data.sac_run import evaluations, finished_sac_run
 from torchrl_aca.errors import DatasetError
 from torchrl_aca.offline import DatasetWriter, OfflineDataset, reference_scores
 from torchrl_aca.offline.registry import ROOT
-from torchrl_aca.training.config import Count, Env, Section, Seed
+from torchrl_aca.training.config import Count, Section, Seed
 from torchrl_aca.training.envs import make_env, task_name
 from torchrl_aca.training.report import plot_returns, versions
 
 Tier = Literal["random", "medium", "medium_replay"]
 Statistic = Literal["mean", "std", "min", "max"]
 Band = Annotated[list[float | None], Field(min_length=2, max_length=2)]
+
+
+class Task(Section):
+    """The section `env` of `make_dataset.yaml`: the task as Gymnasium makes it."""
+
+    name: str = Field(min_length=1)
 
 
 class SACRun(Section):
@@ -38,7 +44,7 @@ class GeneratorConfig(Section):
     """`make_dataset.yaml`."""
 
     tier: Tier
-    env: Env
+    env: Task
     path: str | None
     episodes: Count
     seed: Seed

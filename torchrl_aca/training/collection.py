@@ -14,7 +14,7 @@ from torchrl.envs import GymWrapper
 
 from torchrl_aca.errors import RunError
 from torchrl_aca.training.config import Collector as CollectorSettings
-from torchrl_aca.training.envs import EnvState
+from torchrl_aca.training.env_state import EnvState
 from torchrl_aca.training.randomness import RandomState
 
 
@@ -91,13 +91,14 @@ class Collection:
             self._collector.shutdown()
 
     def why_unsavable(self) -> str | None:
-        """Tries to save the environments, and returns why not where that fails."""
+        """Tries to save the environments, and returns why their episodes cannot go on, if so."""
+        state = EnvState(self.env)
         try:
-            EnvState(self.env).state_dict()
+            state.state_dict()
         except Exception as error:  # environments are foreign code
             self.savable = False
             return f"{type(error).__name__}: {error}"
-        return None
+        return None if state.is_exact else "it is not MuJoCo's, or has wrappers"
 
     def state_dict(self) -> dict[str, Any]:
         """Returns frames, episodes, and the states of the environments where they can be saved."""
@@ -108,13 +109,14 @@ class Collection:
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restores what `state_dict` returned; without environments, new episodes begin."""
+        """Restores what `state_dict` returned; new episodes where their state was not saved."""
         self.frames = state_dict["frames"]
         self.episodes.load_state_dict(state_dict["episodes"])
-        if state_dict["env"] is None:
+        state = EnvState(self.env)
+        if state_dict["env"] is not None:
+            state.load_state_dict(state_dict["env"], in_episode=self.frames > 0)
+        if state_dict["env"] is None or not state.is_exact:
             self.episodes.reset()
-        else:
-            EnvState(self.env).load_state_dict(state_dict["env"], in_episode=self.frames > 0)
 
 
 class EpisodeTracker:

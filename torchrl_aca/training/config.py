@@ -35,10 +35,20 @@ class Section(BaseModel):
         raise PydanticCustomError("misfit", "Input should be {expected}", details)
 
 
+class Wrapper(Section):
+    """A wrapper around an environment; every other key is a keyword of its class."""
+
+    model_config = ConfigDict(extra="allow")
+
+    name: str = Field(min_length=1)
+
+
 class Env(Section):
     """The task."""
 
     name: str = Field(min_length=1)
+    kwargs: dict[str, Any] | None = None
+    wrappers: list[Wrapper] = []
 
 
 class Algo(Section):

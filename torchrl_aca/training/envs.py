@@ -1,4 +1,4 @@
-"""Vectorised Gymnasium environments with a true final observation and an exact, savable state."""
+"""Vectorised Gymnasium environments with a true final observation."""
 
 from __future__ import annotations
 
@@ -6,168 +6,77 @@ import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from typing import Any
 
 import gymnasium as gym
 import mujoco
 import numpy as np
-import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from gymnasium.wrappers import DtypeObservation, TimeLimit
+from gymnasium.wrappers import DtypeObservation, FlattenObservation
 from torchrl.envs import GymWrapper
 
 from torchrl_aca.errors import RunError
-
-_INTEGRATION_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
-
-
-class ResumableEnv(gym.Wrapper):
-    """Saves and restores an environment in the middle of an episode.
-
-    After `load_state_dict`, `reset` returns the restored observation until the first step is made,
-    so a collector that resets its environments when it starts goes on with the saved episode.
-
-    The state is exact for MuJoCo environments. Other environments keep their random stream but
-    begin a new episode, because Gymnasium has no general way to save them.
-    """
-
-    def __init__(self, env: gym.Env) -> None:
-        """Wraps `env`, which must already have its time limit."""
-        super().__init__(env)
-        self._observation = np.empty(0)
-        self._resumed = False
-
-    def reset(self, **kwargs: Any) -> tuple[np.ndarray, dict[str, Any]]:
-        """Starts an episode, or returns to the restored one that has not made a step yet."""
-        if self._resumed:
-            return self._observation, {}
-        self._observation, info = self.env.reset(**kwargs)
-        return self._observation, info
-
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Makes one step and remembers the observation for `state_dict`."""
-        self._resumed = False
-        result = self.env.step(action)
-        self._observation = result[0]
-        return result
-
-    def state_dict(self) -> dict[str, Any]:
-        """Returns random stream, elapsed steps, last observation and the simulator's arrays."""
-        state: dict[str, Any] = {"random": self.unwrapped.np_random.bit_generator.state}
-        if isinstance(getattr(self.unwrapped, "data", None), mujoco.MjData):
-            state["elapsed_steps"] = self.time_limit._elapsed_steps if self.time_limit else None
-            state["observation"] = torch.from_numpy(np.array(self._observation))
-            state["simulation"] = _simulation_state(self.unwrapped.model, self.unwrapped.data)
-        return state
-
-    def load_state_dict(self, state_dict: dict[str, Any], *, in_episode: bool = True) -> None:
-        """Restores what `state_dict` returned into an environment of the same kind.
-
-        Args:
-            state_dict: The state.
-            in_episode: Whether the next `reset` goes on with the state's episode.
-        """
-        self._resumed = False
-        self.reset()  # satisfies the wrappers that forbid a step before a reset
-        self.unwrapped.np_random.bit_generator.state = state_dict["random"]
-        if "simulation" not in state_dict:
-            self.reset()
-            return
-        if self.time_limit:
-            self.time_limit._elapsed_steps = state_dict["elapsed_steps"]
-        self._observation = state_dict["observation"].numpy()
-        _load_simulation_state(self.unwrapped.model, self.unwrapped.data, state_dict["simulation"])
-        self._resumed = in_episode
-
-    @property
-    def time_limit(self) -> TimeLimit | None:
-        """The wrapper that ends episodes, if there is one."""
-        env = self.env
-        while isinstance(env, gym.Wrapper):
-            if isinstance(env, TimeLimit):
-                return env
-            env = env.env
-        return None
+from torchrl_aca.training.config import Env, Wrapper
+from torchrl_aca.training.env_state import ResumableEnv
 
 
-def _simulation_state(model: Any, data: Any) -> dict[str, torch.Tensor]:
-    integration = np.empty(mujoco.mj_stateSize(model, _INTEGRATION_STATE))
-    mujoco.mj_getState(model, data, integration, _INTEGRATION_STATE)
-    # The next step follows from the integration state alone, but rewards and observations also
-    # read derived arrays (body positions, contact forces) that MuJoCo leaves half a step behind.
-    # What has a size in fresh data is what does not depend on the contacts of the moment.
-    fresh = mujoco.MjData(model)
-    names = [
-        name
-        for name in dir(fresh)
-        if not name.startswith("_")
-        and isinstance(value := getattr(fresh, name), np.ndarray)
-        and value.size
-    ]
-    arrays = {name: torch.from_numpy(np.array(getattr(data, name))) for name in names}
-    return {"integration": torch.from_numpy(integration), **arrays}
+def make_env(task: str | Env, **kwargs: Any) -> gym.Env:
+    """Builds one Gymnasium environment with a flat float32 observation.
 
-
-def _load_simulation_state(model: Any, data: Any, state: dict[str, torch.Tensor]) -> None:
-    mujoco.mj_setState(model, data, state["integration"].numpy(), _INTEGRATION_STATE)
-    for name, value in state.items():
-        if name != "integration":
-            getattr(data, name)[...] = value.numpy()
-
-
-class EnvState:
-    """The states of parallel environments, for checkpoints."""
-
-    def __init__(self, env: GymWrapper) -> None:
-        """Takes an environment made by `make_vector_env`."""
-        self.copies: tuple[ResumableEnv, ...] = tuple(env.envs)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Returns the state of each."""
-        return {"copies": [copy.state_dict() for copy in self.copies]}
-
-    def load_state_dict(self, state_dict: dict[str, Any], *, in_episode: bool = True) -> None:
-        """Restores them; build the collector after this, not before.
-
-        Args:
-            state_dict: What `state_dict` returned.
-            in_episode: Whether the next `reset` goes on with the episode of the state. If nothing
-                had been collected yet, it starts the one that was due.
-        """
-        for copy, state in zip(self.copies, state_dict["copies"], strict=True):
-            copy.load_state_dict(state, in_episode=in_episode)
-
-
-def make_env(name: str, **kwargs: Any) -> gym.Env:
-    """Builds one Gymnasium environment with float32 observations.
+    An observation of several parts (a `Dict`, a `Tuple`) becomes one vector of all of them, in the
+    order of its space.
 
     Args:
-        name: A Gymnasium id; "module:Id-v0" imports the module first.
-        **kwargs: For `gymnasium.make`.
+        task: A Gymnasium id; "module:Id-v0" imports the module first. Or the section `env` of a
+            configuration, with keywords and wrappers.
+        **kwargs: More keywords for `gymnasium.make`.
 
     Raises:
-        RunError: If the id is unknown, or actions or observations are not a vector of numbers with
-            finite action bounds.
+        RunError: If the id, a keyword or a wrapper is unknown, or actions or observations are not a
+            vector of numbers with finite action bounds.
     """
+    task = Env(name=task) if isinstance(task, str) else task
     try:
         with _quiet_construction():
-            env = DtypeObservation(gym.make(name, **kwargs), np.float32)
-    except (gym.error.Error, ModuleNotFoundError) as error:
+            env = gym.make(task.name, **{**(task.kwargs or {}), **kwargs})
+    except (gym.error.Error, ImportError, TypeError) as error:
         raise RunError(
-            f"env.name={name!r} cannot be made: {error}. Give the id of an installed Gymnasium "
-            "environment, such as HalfCheetah-v4, or choose env=... from recipes/configs/env."
+            f"env.name={task.name!r} cannot be made: {error}. Give the id of an installed "
+            "Gymnasium environment, such as HalfCheetah-v4, or choose env=... from "
+            f"recipes/configs/env; env.kwargs={task.kwargs} must be what it takes."
         ) from error
-    _check_spaces(name, env)
+    for wrapper in task.wrappers:
+        env = _wrap(env, wrapper)
+    if not isinstance(env.observation_space, gym.spaces.Box):
+        env = FlattenObservation(env)
+    with _quiet_construction():
+        env = DtypeObservation(env, np.float32)
+    _check_spaces(task.name, env)
     return env
+
+
+def _wrap(env: gym.Env, wrapper: Wrapper) -> gym.Env:
+    """Puts a wrapper around an environment: one of Gymnasium's by its name, or "module:Class"."""
+    module, _, name = wrapper.name.rpartition(":")
+    try:
+        kind = getattr(import_module(module or "gymnasium.wrappers"), name)
+        return kind(env, **(wrapper.model_extra or {}))
+    except Exception as error:  # wrappers are foreign code
+        raise RunError(
+            f"env.wrappers: {wrapper.name} cannot be put around {env}: "
+            f"{type(error).__name__}: {error}. Give the name of a class of gymnasium.wrappers, or "
+            "module:Class, and the keywords that it takes."
+        ) from error
 
 
 def task_name(env_id: str) -> str:
     """Returns an id without module and version, as in names of directories: "halfcheetah"."""
-    return re.sub(r"-v\d+$", "", env_id.split(":")[-1]).lower()
+    return re.sub(r"-v\d+$", "", env_id.split(":")[-1]).replace("/", "-").lower()
 
 
 def make_vector_env(
-    name: str, num_envs: int, seed: int, *, max_steps: int | None = None
+    task: str | Env, num_envs: int, seed: int, *, max_steps: int | None = None
 ) -> GymWrapper:
     """Builds `num_envs` parallel environments that step together in this process.
 
@@ -175,7 +84,7 @@ def make_vector_env(
     observation, and the collector starts the next episode.
 
     Args:
-        name: A Gymnasium id.
+        task: See `make_env`.
         num_envs: Number of environments; the batch size of the result is (num_envs,).
         seed: They are seeded with seed, seed + 1, ...
         max_steps: Length after which an episode is cut. Default: the task's own.
@@ -184,7 +93,7 @@ def make_vector_env(
         RunError: See `make_env`.
     """
     limit = {} if max_steps is None else {"max_episode_steps": max_steps}
-    members = [lambda: ResumableEnv(make_env(name, **limit))] * num_envs
+    members = [lambda: ResumableEnv(make_env(task, **limit))] * num_envs
     env = GymWrapper(SyncVectorEnv(members, autoreset_mode=AutoresetMode.DISABLED))
     env.set_seed(seed)
     return env
@@ -200,12 +109,13 @@ def _check_spaces(name: str, env: gym.Env) -> None:
     if not (np.isfinite(actions.low).all() and np.isfinite(actions.high).all()):
         raise RunError(
             f"{name} has unbounded actions ({actions}); expected finite lower and upper bounds. "
-            "Wrap it in gymnasium.wrappers.RescaleAction or declare its true bounds."
+            "Declare its true bounds, or wrap it in a class that does, with env.wrappers."
         )
     if not isinstance(observations, gym.spaces.Box) or len(observations.shape) != 1:
         raise RunError(
-            f"{name} has the observation space {observations}; expected a one-dimensional Box. "
-            "Flatten it with gymnasium.wrappers.FlattenObservation, or write a recipe of your own."
+            f"{name} has the observation space {observations}; expected a one-dimensional Box, or "
+            "parts of which one can be made. Flatten arrays of several dimensions with "
+            "env.wrappers=[{name: FlattenObservation}]; for images write a recipe of your own."
         )
 
 

@@ -14,7 +14,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import RandomPolicy
 
 from torchrl_aca.errors import RunError
-from torchrl_aca.training.config import Eval, RunConfig
+from torchrl_aca.training.config import Env, Eval, RunConfig
 from torchrl_aca.training.envs import make_env, make_vector_env
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
@@ -32,17 +32,18 @@ def evaluation_mode(seed: int) -> Iterator[None]:
         yield
 
 
-def make_eval_env(name: str, settings: Eval) -> GymWrapper:
-    """Builds the environments of the evaluation, one for each episode.
+def make_eval_env(task: str | Env, settings: Eval) -> GymWrapper:
+    """Builds the environments of the evaluation, one for each episode; `task` as in `make_env`.
 
     Raises:
         RunError: If episodes might never end, or see `make_env`.
     """
-    env = make_vector_env(name, settings.episodes, settings.seed, max_steps=settings.max_steps)
+    env = make_vector_env(task, settings.episodes, settings.seed, max_steps=settings.max_steps)
     if env.envs[0].time_limit is None:
         raise RunError(
-            f"{name} has no time limit, so an evaluation of it might never end; expected one. Give "
-            "the length after which the evaluation cuts an episode, as in eval.max_steps=1000."
+            f"{env.envs[0].spec.id} has no time limit, so an evaluation of it might never end; "
+            "expected one. Give the length after which the evaluation cuts an episode, as in "
+            "eval.max_steps=1000."
         )
     return env
 
@@ -86,7 +87,7 @@ def evaluate(policy: Policy, env: EnvBase, seed: int, device: torch.device) -> d
 
 
 def record_video(
-    policy: Policy, env_name: str, path: Path, seed: int, device: torch.device
+    policy: Policy, task: str | Env, path: Path, seed: int, device: torch.device
 ) -> None:
     """Renders one whole episode of the deterministic policy to an MP4 file.
 
@@ -99,7 +100,7 @@ def record_video(
     try:
         import imageio
 
-        env = make_env(env_name, render_mode="rgb_array")
+        env = make_env(task, render_mode="rgb_array")
         observation, _ = env.reset(seed=seed)
         images, done = [env.render()], False
         with evaluation_mode(seed):
@@ -128,5 +129,5 @@ def report_extras(
         print(f"a random policy on the same seeds: {result['return_mean']:.1f}")
     if cfg.video.enabled:
         path = run_dir / "video.mp4"
-        record_video(policy, cfg.env.name, path, cfg.eval.seed, device)
+        record_video(policy, cfg.env, path, cfg.eval.seed, device)
         print(f"video: {path}")

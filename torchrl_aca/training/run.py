@@ -99,7 +99,8 @@ class Run:
         if checkpoint is not None:
             self._restore(checkpoint)
         notes = self._savable_parts()
-        name = f"{cfg.env.name.split(':')[-1]}-{cfg.algo.name}-s{cfg.seed}"
+        task = cfg.env.name.split(":")[-1].replace("/", "-")
+        name = f"{task}-{cfg.algo.name}-s{cfg.seed}"
         resumed = checkpoint is not None
         self.dir = Path(cfg.resume or "") if resumed else make_run_dir(cfg.run_dir, name)
         self._lock = lock(self.dir)
@@ -144,8 +145,8 @@ class Run:
         notes = []
         if why := self.collection.why_unsavable():
             notes.append(
-                f"the state of {self.cfg.env.name} cannot be saved ({why}): checkpoints leave it "
-                "out, and a resumed run begins new episodes"
+                f"the state of {self.cfg.env.name} cannot be saved ({why}): a resumed run begins "
+                "new episodes"
             )
         for name, part in self.parts.items():
             try:
