@@ -398,3 +398,17 @@ def test_an_environment_that_cannot_be_saved_is_left_out_and_said_so(tmp_path, c
         assert rows_of(run_dir / "eval.csv")[-1]["updates"] == "30"
     finally:
         del gym.registry["Legacy-v0"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "lines"),
+    [
+        (("--config-name", "fast"), ["  num_target_candidates: 4", "guidance_weight: 50.0  # w"]),
+        (("algo=sac",), ["seed: 0", "algo: aca, calql", "num_cells: [256, 256, 256]"]),
+    ],
+)
+def test_help_shows_the_files_with_their_comments(arguments, lines, tmp_path):
+    code, output, errors = run(*arguments, "--help", cwd=tmp_path)
+    assert code == 0, errors
+    for line in ("utd_ratio: 0.2  # updates per frame", *lines):
+        assert line in output

@@ -20,7 +20,7 @@ from torchrl_aca.training.checkpoint import (
     save_checkpoint,
 )
 from torchrl_aca.training.files import replace_file, write_text
-from torchrl_aca.training.logging import CsvTable, MetricMeans, ProgressBar
+from torchrl_aca.training.logging import CsvTable, MetricMeans
 from torchrl_aca.training.randomness import RandomState, seed_everything
 from torchrl_aca.training.run import has_reached, passed
 from torchrl_aca.training.run_dir import lock, make_run_dir, require_newest
@@ -143,12 +143,6 @@ def test_an_interval_has_passed_when_a_multiple_lies_between():
     assert passed(5, 9, 10) and passed(10, 9, 10)
     assert not passed(5, 10, 10) and not passed(11, 0, 10)
     assert passed(4, 7, 10)  # 8 lies in between
-
-
-def test_plain_lines_where_there_is_no_terminal(capsys):
-    bar = ProgressBar(total=10, initial=0)
-    bar.show_metrics(5, 25, {"loss": 0.5, "alpha": 3.0})
-    assert capsys.readouterr().out == "updates 5/10  frames 25  loss 0.5\n"
 
 
 def test_one_evaluation_or_no_return_to_reach_never_stops_a_run():

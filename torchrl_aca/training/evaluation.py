@@ -48,7 +48,13 @@ def make_eval_env(task: str | Env, settings: Eval) -> GymWrapper:
     return env
 
 
-def evaluate(policy: Policy, env: EnvBase, seed: int, device: torch.device) -> dict[str, float]:
+def evaluate(
+    policy: Policy,
+    env: EnvBase,
+    seed: int,
+    device: torch.device,
+    watch: Callable[[int], None] | None = None,
+) -> dict[str, float]:
     """Runs exactly one whole episode in each of the parallel environments.
 
     They are seeded anew, so the result depends on the policy and the seed alone. One that has
@@ -60,6 +66,7 @@ def evaluate(policy: Policy, env: EnvBase, seed: int, device: torch.device) -> d
         env: Environment of batch size (num_episodes,); never the one that is trained on.
         seed: First seed of the environments, and the one of the policy's draws.
         device: Device of the policy.
+        watch: Is told after each step how many have been made.
 
     Returns:
         `return_mean`, `return_std` (over episodes, not corrected for the sample), `num_episodes`
@@ -78,6 +85,8 @@ def evaluate(policy: Policy, env: EnvBase, seed: int, device: torch.device) -> d
             lengths += alive
             alive &= ~data["next", "done"].squeeze(-1).cpu()
             data = following
+            if watch is not None:
+                watch(int(lengths.max()))
     return {
         "return_mean": returns.mean().item(),
         "return_std": returns.std(correction=0).item(),

@@ -1,11 +1,10 @@
-"""Where numbers go: CSV tables always, another logger by choice, and the terminal."""
+"""Where numbers go: CSV tables always, and another logger by choice."""
 
 from __future__ import annotations
 
 import csv
 import io
 import math
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,6 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torchrl.record.loggers import get_logger
-from tqdm import tqdm
 
 from torchrl_aca.errors import RunError
 from torchrl_aca.training.config import Logger
@@ -60,7 +58,7 @@ class MetricMeans:
 
 
 class CsvTable:
-    """A CSV file with one column per metric; columns may appear later than the first row."""
+    """A CSV file with one column per metric, from the first row on; columns may appear later."""
 
     def __init__(self, path: Path, until: Mapping[str, int] | None = None) -> None:
         """Opens a table.
@@ -78,7 +76,7 @@ class CsvTable:
                 reader = csv.DictReader(file)
                 self.columns = list(reader.fieldnames or [])
                 self.rows = [row for row in reader if not _is_later(row, until)]
-        self._rewrite()
+            self._rewrite()
 
     def append(self, row: Mapping[str, Any]) -> None:
         """Adds a row and writes it at once."""
@@ -194,48 +192,3 @@ def require_wandb_login(settings: Logger) -> None:
             "logger.backend=wandb: expected a wandb login, found none. Run `wandb login`, set "
             "WANDB_API_KEY, or use logger.wandb_mode=offline."
         )
-
-
-SHOWN = ("per_second", "return", "loss")
-
-
-def _status(values: Mapping[str, float]) -> str:
-    # The speed first: what does not fit on a narrow terminal is cut off.
-    shown = [(name, values[name]) for part in SHOWN for name in values if part in name]
-    return "  ".join(f"{name} {value:.4g}" for name, value in shown)
-
-
-class ProgressBar:
-    """A progress bar on a terminal; plain lines elsewhere."""
-
-    def __init__(self, total: int, initial: int) -> None:
-        """Counts updates from `initial` to `total`."""
-        self.total = total
-        self.bar = tqdm(total=total, initial=initial, unit="upd", disable=not sys.stdout.isatty())
-
-    def advance(self, updates: int) -> None:
-        """Moves the bar to `updates`."""
-        self.bar.set_description_str("train" if updates else "warm-up", refresh=False)
-        self.bar.update(updates - self.bar.n)
-
-    def show_metrics(self, updates: int, frames: int, values: Mapping[str, float]) -> None:
-        """Shows a row of training metrics behind the bar, or as a line of its own."""
-        if self.bar.disable:
-            self.show_evaluation(updates, frames, values)
-        else:
-            self.bar.set_postfix_str(_status(values), refresh=False)
-
-    def show_evaluation(self, updates: int, frames: int, values: Mapping[str, float]) -> None:
-        """Shows a row of evaluation results as a line of its own."""
-        self.write(f"updates {updates}/{self.total}  frames {frames}  {_status(values)}")
-
-    def write(self, message: str) -> None:
-        """Prints a line above the bar."""
-        if self.bar.disable:
-            print(message, flush=True)
-        else:
-            self.bar.write(message)
-
-    def close(self) -> None:
-        """Leaves the bar as it stands."""
-        self.bar.close()

@@ -23,8 +23,9 @@ from torchrl_aca.training.checkpoint import Counters, restore, save_checkpoint
 from torchrl_aca.training.collection import BadDataError, Collection
 from torchrl_aca.training.config import RunConfig
 from torchrl_aca.training.files import write_text
-from torchrl_aca.training.logging import MetricMeans, ProgressBar, RunLogger
+from torchrl_aca.training.logging import MetricMeans, RunLogger
 from torchrl_aca.training.pretrained import save_pretrained
+from torchrl_aca.training.progress import Pace, ProgressBar
 from torchrl_aca.training.randomness import RandomState
 from torchrl_aca.training.report import plot_curve, versions, write_card
 from torchrl_aca.training.run_dir import lock, make_run_dir, require_newest
@@ -55,7 +56,7 @@ class Run:
         agent: Agent,
         buffer: Any,
         collection: Collection,
-        evaluate: Callable[[], Metrics],
+        evaluate: Callable[[Callable[[int], None]], Metrics],
         checkpoint: dict[str, Any] | None = None,
         *,
         device: torch.device | str = "cpu",
@@ -70,7 +71,7 @@ class Run:
             agent: What is trained.
             buffer: A replay buffer, or a mixture that saves itself; `sample()` gives a batch.
             collection: Where experience comes from.
-            evaluate: Evaluates the policy.
+            evaluate: Evaluates the policy; takes what is to be told after each step.
             checkpoint: What `read_checkpoint` returned, to go on from.
             device: Where batches go.
             script: The recipe that can go on with the run.
@@ -254,7 +255,11 @@ class Run:
             save_pretrained(self.dir, self.parts, self.config, self.facts)
         if passed(cfg.checkpoint.interval, since, now) or now == last_offline:
             self.save()
-        self.bar.advance(self.counters.total)
+        if now == last_offline:  # another phase, another speed
+            self.bar.pace = Pace(self.counters.total)
+        warmed_up = last_offline is not None or self.counters.updates
+        frames = f"{self.collection.frames}/{cfg.collector.warmup_frames} frames"
+        self.bar.advance(self.counters.total, "train" if warmed_up else f"warm-up {frames}")
 
     # --- what it leaves ---------------------------------------------------------------------------
 
@@ -274,10 +279,11 @@ class Run:
     def log_evaluation(self) -> None:
         """Evaluates the policy and adds a row of the results."""
         self._signal.activity = "evaluation"
-        values = self._evaluate()
+        values = self._evaluate(lambda step: self.bar.describe(f"evaluation, step {step}"))
         self._signal.activity = "iteration"
         self.logger.log("eval", self._axes(), self.counters.total, values)
-        self.bar.show_evaluation(self.counters.total, self.collection.frames, values)
+        best = max(float(row["return_mean"]) for row in self.logger.tables["eval"].rows)
+        self.bar.show_evaluation(self.counters.total, self.collection.frames, values, best)
 
     def _speed(self) -> dict[str, float]:
         then, updates, frames = self._lap
