@@ -14,6 +14,7 @@ online one. `pretrained=RUN_DIR` takes the first from another run. Every key is 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
 from typing import Annotated, Any
@@ -96,8 +97,8 @@ def train(cfg: DictConfig, checkpoint: dict[str, Any] | None = None) -> Path:
     if cfg.pretrained is not None and checkpoint is None:
         pretrained = cfg.optim.offline_updates = start_from(cfg, agent, facts)
 
-    def evaluation() -> dict[str, float]:
-        result = evaluate(agent.policy, eval_env, cfg.eval.seed, device)
+    def evaluation(watch: Callable[[int], None]) -> dict[str, float]:
+        result = evaluate(agent.policy, eval_env, cfg.eval.seed, device, watch)
         if scores:
             result["normalized_score"] = normalized_score(result["return_mean"], scores)
         return result
