@@ -1,0 +1,36 @@
+"""The commands of an installed package: each runs a script of this folder, as it stands."""
+
+from __future__ import annotations
+
+import runpy
+import sys
+from pathlib import Path
+
+FOLDER = Path(__file__).resolve().parent
+
+
+def train() -> None:
+    _run("online_mujoco.py")
+
+
+def train_offline_to_online() -> None:
+    _run("o2o_halfcheetah.py")
+
+
+def make_dataset() -> None:
+    _run("make_dataset.py")
+
+
+def import_dataset() -> None:
+    _run("import_dataset.py")
+
+
+def bandit() -> None:
+    _run("bandit_2d.py")
+
+
+def _run(script: str) -> None:
+    path = str(FOLDER / script)
+    sys.path.insert(0, str(FOLDER))  # where Python looks when the script itself is run
+    sys.argv[0] = path
+    runpy.run_path(path, run_name="__main__")
