@@ -23,7 +23,7 @@ import hydra
 from omegaconf import DictConfig
 from pydantic import Field, model_validator
 
-import reference  # noqa: F401
+import help_text  # noqa: F401
 import renderer  # noqa: F401
 from agents import AGENTS, configured, make_agent
 from agents.pretrained import require_offline_phase, start_from

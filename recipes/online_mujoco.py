@@ -19,7 +19,7 @@ from typing import Any
 import hydra
 from omegaconf import DictConfig
 
-import reference  # noqa: F401
+import help_text  # noqa: F401
 import renderer  # noqa: F401
 from agents import configured, make_agent
 from torchrl_aca.replay import make_replay_buffer
