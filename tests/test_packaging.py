@@ -54,6 +54,7 @@ ALLOWED = {
         "td_loss",
     },
     "interop": {"functional", "critic"},
+    "trainer": {"checks"},
 }
 # What each room may import besides itself.
 ROOMS = {
