@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -16,11 +17,13 @@ from torchrl.objectives.utils import distance_loss
 
 from torchrl_aca import functional as F
 from torchrl_aca.actor import CriticGuidedDenoisingActor
-from torchrl_aca.checks import check_at_least, check_choice
+from torchrl_aca.checks import check_above, check_at_least, check_choice
 from torchrl_aca.critic import NoiseLevelCriticBase
 from torchrl_aca.td_loss import OpenLoopAlpha, TDLoss, next_key
 
 __all__ = ["ACALoss"]
+
+LOG_STEP = 0.1  # half the difference in log w by which the automatic guidance weight looks about
 
 
 class ACALoss(OpenLoopAlpha, TDLoss):
@@ -51,6 +54,13 @@ class ACALoss(OpenLoopAlpha, TDLoss):
         qvalue_network: may be passed for symmetry with TorchRL's losses; must be the actor's
             critic.
         num_target_candidates: ``N`` of ``a'_0``. Default: the actor's ``num_candidates``.
+        guidance_weight: ``"fixed"``, or ``"auto"`` for :meth:`step_guidance_weight`, which moves
+            the actor's ``w`` from where it is; it needs two target candidates or more. Default:
+            ``"fixed"``, the paper.
+        guidance_weight_lr: rate of the steps on ``log w``. Default: 0.01.
+        target_spread: standard deviation below which those steps do not press the candidates, in
+            critic units, or ``"auto"`` for that of a Gaussian of the target entropy,
+            ``exp(H_target / A) / sqrt(2 pi e)``. Default: ``"auto"``.
         noise_level_target: ``"mean"`` over the critics (official code) or each critic's own value,
             ``"self"`` (paper). Default: ``"mean"``.
         target_entropy: ``H_target`` in nats, or ``"auto"`` for ``-target_entropy_scale * A``.
@@ -95,6 +105,8 @@ class ACALoss(OpenLoopAlpha, TDLoss):
             noise_level: optional given noise levels.
             noise: optional given noise of the noise-level loss.
             next_action: optional given next action, in env units.
+            candidate_spread: where the spread of the target's candidates is written.
+            guidance_gain: where their gain by more guidance is written.
             priority: where the TD error for prioritised replay is written.
             reward: the reward, below ``"next"``.
             done: the done flag, below ``"next"``.
@@ -108,6 +120,8 @@ class ACALoss(OpenLoopAlpha, TDLoss):
         noise_level: NestedKey = "noise_level"
         noise: NestedKey = "noise"
         next_action: NestedKey = "next_action"
+        candidate_spread: NestedKey = "candidate_spread"
+        guidance_gain: NestedKey = "guidance_gain"
         priority: NestedKey = "td_error"
         reward: NestedKey = "reward"
         done: NestedKey = "done"
@@ -140,6 +154,9 @@ class ACALoss(OpenLoopAlpha, TDLoss):
         *,
         qvalue_network: nn.Module | None = None,
         num_target_candidates: int | None = None,
+        guidance_weight: Literal["fixed", "auto"] = "fixed",
+        guidance_weight_lr: float = 0.01,
+        target_spread: float | Literal["auto"] = "auto",
         noise_level_target: Literal["mean", "self"] = "mean",
         target_entropy: float | Literal["auto"] = "auto",
         target_entropy_scale: float = 0.9,
@@ -162,12 +179,19 @@ class ACALoss(OpenLoopAlpha, TDLoss):
         if num_target_candidates is None:
             num_target_candidates = actor_network.num_candidates
         check_at_least(1, num_target_candidates=num_target_candidates)
+        check_choice(("fixed", "auto"), guidance_weight=guidance_weight)
+        check_above(0, guidance_weight_lr=guidance_weight_lr)
+        if guidance_weight == "auto":
+            check_at_least(2, num_target_candidates=num_target_candidates)
+            check_above(0, guidance_weight_of_the_actor=float(actor_network.guidance_weight))
         # The actor is no submodule: its parameters are listed below, and only once.
         self.__dict__["actor_network"] = actor_network
         self.convert_to_functional(critic, "qvalue_network", create_target_params=delay_qvalue)
         self.register_buffer("guidance_weight", actor_network.guidance_weight)
         self.delay_qvalue = delay_qvalue
         self.num_target_candidates = num_target_candidates
+        self.auto_guidance = guidance_weight == "auto"
+        self.guidance_weight_lr = guidance_weight_lr
         self.noise_level_target = noise_level_target
         self.reward_scale = reward_scale
         self.loss_function = loss_function
@@ -175,6 +199,12 @@ class ACALoss(OpenLoopAlpha, TDLoss):
         self.use_prioritized_weights = use_prioritized_weights
         self.use_given_draws = use_given_draws
         self._init_alpha(target_entropy, target_entropy_scale, entropy_noise_scale)
+        if target_spread == "auto":
+            std = F.entropy_std(self.target_entropy, actor_network.action_dim)
+        else:
+            check_above(0, target_spread=target_spread)
+            std = self.target_entropy.new_tensor(target_spread)
+        self.register_buffer("target_spread", std, persistent=False)
         self.set_keys(
             action=actor_network.out_keys[0],
             state_action_value=critic.value_key,
@@ -219,6 +249,29 @@ class ACALoss(OpenLoopAlpha, TDLoss):
         weights = self._maybe_get_priority_weight(tensordict)
         return self._output("loss_noise_level", error, tensordict, metrics, weights)
 
+    @torch.no_grad()
+    def step_guidance_weight(self, tensordict: TensorDictBase) -> TensorDict:
+        """Move ``log w`` by ``guidance_weight_lr`` times :func:`~.functional.guidance_step`.
+
+        Args:
+            tensordict: a batch that :meth:`qvalue_loss` or :meth:`sample_next_action` has seen,
+                with ``guidance_weight="auto"``: they write what is read here.
+
+        Returns:
+            The metrics ``guidance_weight``, ``candidate_spread`` and ``guidance_gain``.
+
+        Raises:
+            KeyError: if they have not written it.
+        """
+        keys = self.tensor_keys
+        spread = tensordict[keys.candidate_spread].square().mean().sqrt()
+        gain = tensordict[keys.guidance_gain].mean()
+        step = self.guidance_weight_lr * F.guidance_step(spread, self.target_spread, gain)
+        # In place: actor, loss and whoever else holds the weight see the new one.
+        self.guidance_weight.mul_(step.exp())
+        metrics = {"candidate_spread": spread, "guidance_gain": gain}
+        return TensorDict({"guidance_weight": self.guidance_weight.to(spread.dtype), **metrics})
+
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """All three losses and their metrics; see the class."""
@@ -240,13 +293,33 @@ class ACALoss(OpenLoopAlpha, TDLoss):
         """Draws ``a'_0`` of the target, in env units, shape ``(*batch, A)``.
 
         :meth:`qvalue_loss` does so by itself where the input has no ``next_action``. Drawn
-        beforehand, it lets the rest of the loss be compiled without the chain.
+        beforehand, it lets the rest of the loss be compiled without the chain. With
+        ``guidance_weight="auto"`` it writes the spread of the candidates and their gain by more
+        guidance to ``tensordict``, both of shape ``(*batch,)``.
         """
-        observation = [tensordict[next_key(key)] for key in self.actor_network.in_keys]
+        actor = self.actor_network
+        observation = [tensordict[next_key(key)] for key in actor.in_keys]
         batch = tensordict[self.tensor_keys.action].shape[:-1]
-        return self.actor_network.sample(
-            observation, batch, num_candidates=self.num_target_candidates
-        )
+        features = actor.encode(observation, batch)
+        draws = actor.draws(batch.numel(), self.num_target_candidates)
+        candidates = self._candidates(features, draws[:-1])
+        values = actor.values(features, candidates)
+        if self.auto_guidance:
+            spread = F.candidate_spread(candidates)
+            gain = F.guidance_gain(values, 2 * LOG_STEP)
+            tensordict.set(self.tensor_keys.candidate_spread, spread.reshape(batch))
+            tensordict.set(self.tensor_keys.guidance_gain, gain.reshape(batch))
+        action = actor.explore(F.select_best(candidates, values), draws[-1, 0])
+        return actor.to_env(action).reshape(*batch, actor.action_dim)
+
+    def _candidates(self, features: Any, noise: Tensor) -> Tensor:
+        """The target's candidates ``(N, B, A)``; to tune ``w``, from a little above and below."""
+        actor = self.actor_network
+        if not self.auto_guidance:
+            return actor.propose(features, noise)
+        weights = [self.guidance_weight * math.exp(sign * LOG_STEP) for sign in (1, -1)]
+        halves = zip(noise.tensor_split(2, dim=1), weights, strict=True)
+        return torch.cat([actor.propose(features, half, weight) for half, weight in halves])
 
     @torch.no_grad()
     def _target_value(self, tensordict: TensorDictBase) -> Tensor:
