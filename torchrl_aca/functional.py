@@ -35,6 +35,7 @@ __all__ = [
     "predict_clean",
     "select_best",
     "sinusoidal_embedding",
+    "soft_value",
     "surrogate_entropy",
     "vp_betas",
 ]
@@ -227,6 +228,26 @@ def select_best(candidates: Tensor, values: Tensor) -> Tensor:
     """
     best = values.amin(-1).argmax(0)
     return candidates.take_along_dim(best[None, ..., None], dim=0).squeeze(0)
+
+
+def soft_value(values: Tensor, temperature: float) -> Tensor:
+    """``tau log mean_n exp(V_n / tau)``: from the mean over the candidates to their best.
+
+    ``V_n`` is the smallest critic's value. The mean for ``tau -> inf``, the maximum for
+    ``tau -> 0`` (mellowmax, Asadi & Littman 2017); precise at both ends.
+
+    Args:
+        values: critic values of shape ``(N, *batch, E)``.
+        temperature: ``tau`` above 0, in units of the values.
+
+    Returns:
+        Tensor of shape ``(*batch,)``.
+    """
+    lowest = values.amin(-1)
+    highest = lowest.amax(0)
+    # expm1 and log1p, as for a large tau all exponentials round to 1 and the mean would be lost.
+    excess = ((lowest - highest) / temperature).expm1().mean(0)
+    return highest + temperature * excess.log1p()
 
 
 def surrogate_entropy(log_alpha: Tensor, action_dim: int, noise_scale: float = 0.1) -> Tensor:
