@@ -30,7 +30,7 @@ CPU = torch.device("cpu")
 EVERY = sorted(AGENTS)
 VARIANTS = [
     *((algo, []) for algo in EVERY),
-    ("aca", ["aca.guidance_weight=auto"]),
+    ("aca", ["aca.guidance_weight=auto", "aca.target_value=soft"]),
     ("dacer", ["variant=dacer_sdac_repo"]),
     ("dipo", ["variant=dipo_sdac_repo"]),
     ("rlpd", ["variant=wsrl"]),

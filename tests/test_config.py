@@ -22,6 +22,8 @@ REFUSED = [
     ("aca.guidance_weight_init=0", "aca.guidance_weight_init=0: expected greater than 0"),
     ("aca.guidance_weight_init=auto", "aca.guidance_weight_init='auto': expected a valid number"),
     ("aca.guidance_weight_lr=0", "aca.guidance_weight_lr=0: expected greater than 0"),
+    ("aca.target_value=mean", "aca.target_value='mean': expected 'best' or 'soft'"),
+    ("aca.temperature=0", "aca.temperature=0: expected greater than 0"),
     ("aca.num_cells=5", "aca.num_cells=5: expected a valid list"),
     ("aca.num_cells=null", "aca.num_cells=None: expected a valid list"),
     ("aca.num_cells=[]", "aca.num_cells=.*at least 1 item"),

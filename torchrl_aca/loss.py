@@ -54,6 +54,10 @@ class ACALoss(OpenLoopAlpha, TDLoss):
         qvalue_network: may be passed for symmetry with TorchRL's losses; must be the actor's
             critic.
         num_target_candidates: ``N`` of ``a'_0``. Default: the actor's ``num_candidates``.
+        target_value: value of the next state: of the ``"best"`` candidate (paper), or the ``"soft"``
+            value of all of them, ``tau log mean_n exp(min_i Q_bar_i(s', a'_n, 0) / tau)``, each
+            with exploration noise of its own. Default: ``"best"``.
+        temperature: ``tau`` of the soft value, in scaled reward. Default: 0.1.
         guidance_weight: ``"fixed"``, or ``"auto"`` for :meth:`step_guidance_weight`, which moves
             the actor's ``w`` from where it is; it needs two target candidates or more. Default:
             ``"fixed"``, the paper.
@@ -79,7 +83,8 @@ class ACALoss(OpenLoopAlpha, TDLoss):
             always. Default: True.
 
     Random draws are taken from the input where it has them: ``noise_level`` (from ``1..T``),
-    ``noise`` (standard normal, shape of the action) and ``next_action`` (``a'_0`` in env units).
+    ``noise`` (standard normal, shape of the action) and ``next_action`` (``a'_0`` in env units, with
+    ``target_value="soft"`` all of them, of shape ``(*batch, N, A)``).
     Where replay data hold entries of these names that mean something else, rename what the loss
     looks for with :meth:`set_keys`, or pass ``use_given_draws=False``.
 
@@ -154,6 +159,8 @@ class ACALoss(OpenLoopAlpha, TDLoss):
         *,
         qvalue_network: nn.Module | None = None,
         num_target_candidates: int | None = None,
+        target_value: Literal["best", "soft"] = "best",
+        temperature: float = 0.1,
         guidance_weight: Literal["fixed", "auto"] = "fixed",
         guidance_weight_lr: float = 0.01,
         target_spread: float | Literal["auto"] = "auto",
@@ -179,6 +186,8 @@ class ACALoss(OpenLoopAlpha, TDLoss):
         if num_target_candidates is None:
             num_target_candidates = actor_network.num_candidates
         check_at_least(1, num_target_candidates=num_target_candidates)
+        check_choice(("best", "soft"), target_value=target_value)
+        check_above(0, temperature=temperature)
         check_choice(("fixed", "auto"), guidance_weight=guidance_weight)
         check_above(0, guidance_weight_lr=guidance_weight_lr)
         if guidance_weight == "auto":
@@ -190,6 +199,7 @@ class ACALoss(OpenLoopAlpha, TDLoss):
         self.register_buffer("guidance_weight", actor_network.guidance_weight)
         self.delay_qvalue = delay_qvalue
         self.num_target_candidates = num_target_candidates
+        self.target_value, self.temperature = target_value, temperature
         self.auto_guidance = guidance_weight == "auto"
         self.guidance_weight_lr = guidance_weight_lr
         self.noise_level_target = noise_level_target
@@ -292,6 +302,8 @@ class ACALoss(OpenLoopAlpha, TDLoss):
     def sample_next_action(self, tensordict: TensorDictBase) -> Tensor:
         """Draws ``a'_0`` of the target, in env units, shape ``(*batch, A)``.
 
+        With ``target_value="soft"`` it is all candidates, of shape ``(*batch, N, A)``.
+
         :meth:`qvalue_loss` does so by itself where the input has no ``next_action``. Drawn
         beforehand, it lets the rest of the loss be compiled without the chain. With
         ``guidance_weight="auto"`` it writes the spread of the candidates and their gain by more
@@ -303,14 +315,19 @@ class ACALoss(OpenLoopAlpha, TDLoss):
         features = actor.encode(observation, batch)
         draws = actor.draws(batch.numel(), self.num_target_candidates)
         candidates = self._candidates(features, draws[:-1])
-        values = actor.values(features, candidates)
+        soft = self.target_value == "soft"
+        if self.auto_guidance or not soft:
+            values = actor.values(features, candidates)
         if self.auto_guidance:
             spread = F.candidate_spread(candidates)
             gain = F.guidance_gain(values, 2 * LOG_STEP)
             tensordict.set(self.tensor_keys.candidate_spread, spread.reshape(batch))
             tensordict.set(self.tensor_keys.guidance_gain, gain.reshape(batch))
-        action = actor.explore(F.select_best(candidates, values), draws[-1, 0])
-        return actor.to_env(action).reshape(*batch, actor.action_dim)
+        if soft:
+            action = actor.explore(candidates, draws[-1]).movedim(0, 1)
+        else:
+            action = actor.explore(F.select_best(candidates, values), draws[-1, 0])
+        return actor.to_env(action).reshape(*batch, *action.shape[1:])
 
     def _candidates(self, features: Any, noise: Tensor) -> Tensor:
         """The target's candidates ``(N, B, A)``; to tune ``w``, from a little above and below."""
@@ -330,11 +347,22 @@ class ACALoss(OpenLoopAlpha, TDLoss):
         if next_action is None:
             next_action = self.sample_next_action(tensordict)
         next_action = actor.from_env(next_action)
+        batch = tensordict[keys.action].shape[:-1]
         with self._critics(self._target_params()):
-            features = actor.encode(observation, next_action.shape[:-1])
-            next_values = self._values(features, next_action, self._clean_level(next_action))
-        next_value = next_values.amin(-1, keepdim=True)
+            features = actor.encode(observation, batch)
+            if self.target_value == "soft":
+                next_value = self._soft_value(features, next_action).reshape(*batch, 1)
+            else:
+                next_values = self._values(features, next_action, self._clean_level(next_action))
+                next_value = next_values.amin(-1, keepdim=True)
         return self._td_target(tensordict, next_value, self.reward_scale)
+
+    def _soft_value(self, features: Any, actions: Tensor) -> Tensor:
+        """Soft value ``(B,)`` of actions ``(*batch, N, A)``, in one pass over ``N B`` rows."""
+        candidates = actions.reshape(-1, *actions.shape[-2:]).movedim(1, 0)
+        level = torch.zeros((), dtype=torch.long, device=actions.device)
+        values = self.qvalue_network.evaluate(features, candidates, level)
+        return F.soft_value(values, self.temperature)
 
     def _state_and_action(self, tensordict: TensorDictBase) -> tuple[list[Tensor], Tensor]:
         """Observations as they are, and the action in critic units."""

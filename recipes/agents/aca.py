@@ -51,6 +51,8 @@ class ACASettings(Section):
     num_cells: Widths
     num_critics: Annotated[int, Field(ge=1, le=1000)]
     first_level: Annotated[int, Field(ge=0, le=1)]
+    target_value: Literal["best", "soft"]
+    temperature: Positive
     guidance_weight: Annotated[NonNegative, *AutoOr]
     guidance_weight_init: Positive
     guidance_weight_lr: Positive
@@ -126,6 +128,8 @@ def make_aca_loss(cfg: Any, env: EnvBase, device: torch.device) -> ACALoss:
     loss = ACALoss(
         actor,
         num_target_candidates=settings.num_target_candidates,
+        target_value=settings.target_value,
+        temperature=settings.temperature,
         guidance_weight="auto" if auto else "fixed",
         guidance_weight_lr=settings.guidance_weight_lr,
         noise_level_target=settings.noise_level_target,
