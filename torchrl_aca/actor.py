@@ -21,7 +21,7 @@ from torchrl_aca.chain_policy import ChainPolicy
 from torchrl_aca.checks import check_above, check_at_least, check_choice, first_parameter
 from torchrl_aca.critic import NoiseLevelCriticBase
 from torchrl_aca.custom_critic import as_noise_level_critic
-from torchrl_aca.schedule import NoiseSchedule
+from torchrl_aca.schedule import NoiseSchedule, VarianceExplodingSchedule
 
 __all__ = ["CriticGuidedDenoisingActor"]
 
@@ -102,7 +102,7 @@ class CriticGuidedDenoisingActor(ChainPolicy):
     def __init__(
         self,
         critic: nn.Module,
-        schedule: NoiseSchedule,
+        schedule: NoiseSchedule | VarianceExplodingSchedule,
         *,
         spec: TensorSpec | None = None,
         action_dim: int | None = None,

@@ -65,8 +65,9 @@ class ACALoss(OpenLoopAlpha, TDLoss):
         target_spread: standard deviation below which those steps do not press the candidates, in
             critic units, or ``"auto"`` for that of a Gaussian of the target entropy,
             ``exp(H_target / A) / sqrt(2 pi e)``. Default: ``"auto"``.
-        noise_level_target: ``"mean"`` over the critics (official code) or each critic's own value,
-            ``"self"`` (paper). Default: ``"mean"``.
+        noise_level_target: ``"mean"`` over the critics (official code), each critic's own value,
+            ``"self"`` (paper), or ``"target"``, the mean over the target critics (NC-LQL). Default:
+            ``"mean"``.
         target_entropy: ``H_target`` in nats, or ``"auto"`` for ``-target_entropy_scale * A``.
         target_entropy_scale: default 0.9.
         entropy_noise_scale: the noise scale inside ``H``. The official code has 0.1 here whatever
@@ -164,7 +165,7 @@ class ACALoss(OpenLoopAlpha, TDLoss):
         guidance_weight: Literal["fixed", "auto"] = "fixed",
         guidance_weight_lr: float = 0.01,
         target_spread: float | Literal["auto"] = "auto",
-        noise_level_target: Literal["mean", "self"] = "mean",
+        noise_level_target: Literal["mean", "self", "target"] = "mean",
         target_entropy: float | Literal["auto"] = "auto",
         target_entropy_scale: float = 0.9,
         entropy_noise_scale: float = 0.1,
@@ -182,7 +183,7 @@ class ACALoss(OpenLoopAlpha, TDLoss):
                 "qvalue_network must be actor_network.critic: in ACA the critic is the actor. "
                 "Leave it out, or build the actor with this network."
             )
-        check_choice(("mean", "self"), noise_level_target=noise_level_target)
+        check_choice(("mean", "self", "target"), noise_level_target=noise_level_target)
         if num_target_candidates is None:
             num_target_candidates = actor_network.num_candidates
         check_at_least(1, num_target_candidates=num_target_candidates)
@@ -250,8 +251,7 @@ class ACALoss(OpenLoopAlpha, TDLoss):
         noisy_action = schedule.add_noise(action, noise, level)
         with self._critics(self.qvalue_network_params):
             features = self.actor_network.encode(observation, action.shape[:-1])
-            with torch.no_grad():
-                clean_value = self._values(features, action, self._clean_level(action))
+            clean_value = self._clean_value(features, observation, action)
             value = self._values(features, noisy_action, level)
         target = F.noise_level_target(clean_value, self.noise_level_target)
         error = distance_loss(value, target, self.loss_function).sum(-1)
@@ -363,6 +363,15 @@ class ACALoss(OpenLoopAlpha, TDLoss):
         level = torch.zeros((), dtype=torch.long, device=actions.device)
         values = self.qvalue_network.evaluate(features, candidates, level)
         return F.soft_value(values, self.temperature)
+
+    @torch.no_grad()
+    def _clean_value(self, features: Any, observation: list[Tensor], action: Tensor) -> Tensor:
+        """What the noisy levels learn, ``(*batch, E)``: by the online critics or their targets."""
+        if self.noise_level_target != "target":
+            return self._values(features, action, self._clean_level(action))
+        with self._critics(self._target_params()):
+            features = self.actor_network.encode(observation, action.shape[:-1])
+            return self._values(features, action, self._clean_level(action))
 
     def _state_and_action(self, tensordict: TensorDictBase) -> tuple[list[Tensor], Tensor]:
         """Observations as they are, and the action in critic units."""
