@@ -8,6 +8,7 @@
 - aca (Diffusion-Q_t): denoising, guided by a critic that knows the noise level;
 - diffusion_q: the same chain, guided by a plain critic Q(s, a);
 - langevin_q: Langevin steps along the plain critic's gradient;
+- nclql: annealed Langevin steps along a critic that knows the noise level;
 - sdac, qsm, dacer, dipo: diffusion policies that learn from the plain critic (bandit/rivals.py).
 
 Actions are in the modes' own units, in which a_T ~ N(0, I) lies about their circle: the actors get

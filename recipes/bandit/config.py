@@ -24,7 +24,7 @@ from torchrl_aca.training.config import (
 )
 
 Method = Literal[tuple(METHODS)]
-GUIDED = ("aca", "diffusion_q", "langevin_q")
+GUIDED = ("aca", "diffusion_q", "langevin_q", "nclql")
 RIVALS = ("sdac", "qsm", "dacer", "dipo")
 Processes = Annotated[int, Field(ge=1, le=4096)]
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Bounded
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MLP, ValueOperator
 
@@ -17,7 +18,9 @@ from bandit.env import mode_shares, reward
 from bandit.tables import Row
 from torchrl_aca import ACALoss, CriticGuidedDenoisingActor, NoiseLevelCritic
 from torchrl_aca.baselines import DiffusionPolicy
+from torchrl_aca.langevin_actor import AnnealedLangevinActor
 from torchrl_aca.replay import make_replay_buffer, transitions
+from torchrl_aca.schedule import VarianceExplodingSchedule
 from torchrl_aca.training.randomness import seed_everything
 
 Actor = CriticGuidedDenoisingActor | DiffusionPolicy
@@ -26,6 +29,8 @@ Actor = CriticGuidedDenoisingActor | DiffusionPolicy
 def make_actor(cfg: BanditConfig, method: str) -> CriticGuidedDenoisingActor:
     """The method's sampler on a fresh critic of its own."""
     chain, num_cells = cfg.chain, cfg.critic.num_cells
+    if method == "nclql":
+        return make_nclql(cfg)
     if method == "aca":
         critic = NoiseLevelCritic(
             1, 2, num_steps=chain.num_steps, num_critics=cfg.critic.num_critics, num_cells=num_cells
@@ -46,6 +51,27 @@ def make_actor(cfg: BanditConfig, method: str) -> CriticGuidedDenoisingActor:
         sampler="langevin" if method == "langevin_q" else "denoising",
         langevin_step_size=chain.langevin_step_size,
         exploration_noise=0.0,
+        deterministic_draws="fresh",
+    )
+
+
+def make_nclql(cfg: BanditConfig) -> AnnealedLangevinActor:
+    """NC-LQL's sampler with its own noise and steps, in the box of the random actions."""
+    chain, half_width = cfg.chain, cfg.collector.half_width
+    num_steps = chain.num_steps - 1  # its chain visits level 0 too
+    critic = NoiseLevelCritic(
+        1,
+        2,
+        num_steps=num_steps,
+        num_critics=cfg.critic.num_critics,
+        num_cells=cfg.critic.num_cells,
+    )
+    return AnnealedLangevinActor(
+        critic,
+        VarianceExplodingSchedule(num_steps),
+        spec=Bounded(-half_width, half_width, shape=(2,)),
+        guidance_weight=cfg.collector.guidance_weight["nclql"],
+        normalize_gradient=chain.normalize_gradient,
         deterministic_draws="fresh",
     )
 
@@ -82,7 +108,7 @@ def train(
             batch = buffer.sample()
             batch["next_action"] = batch["action"]  # the last step needs none: spare the chain
             objective = loss.qvalue_loss(batch)["loss_qvalue"]
-            if method == "aca":
+            if method in ("aca", "nclql"):
                 objective = objective + loss.noise_level_loss(batch)["loss_noise_level"]
             optimizer.zero_grad()
             objective.backward()
