@@ -15,8 +15,8 @@ import bandit_2d
 import recipe_cases
 from bandit import guided, rivals
 from bandit.config import BanditConfig, variants
-from bandit.launch import begin
 from bandit.env import TwoDBandit, mode_shares, reward
+from bandit.launch import begin
 from recipe_cases import rows_of
 from torchrl_aca.baselines import DIPOLoss
 from torchrl_aca.errors import RunError

@@ -1,4 +1,4 @@
-"""NC-LQL's parts: the noise of its levels, its chain against a restatement, and its critic's target."""
+"""NC-LQL's parts: the noise of its levels, its chain, and what its critic learns."""
 
 from __future__ import annotations
 
@@ -49,6 +49,7 @@ def test_the_chain_equals_its_restatement(unit):
     observation = torch.randn(BATCH, OBS, dtype=torch.float64)
     noise = torch.randn(M * (T + 1) + 1, CANDIDATES, BATCH, ACTION, dtype=torch.float64)
     critics = to_official(actor.critic)
+    states = np.broadcast_to(observation, (CANDIDATES, BATCH, OBS))
     uniform = torch.distributions.Normal(0, 1).cdf(noise[0])
     action, row = 2 * uniform.numpy() - 1, 0
     for level in (3, 2, 1, 0):
@@ -56,9 +57,8 @@ def test_the_chain_equals_its_restatement(unit):
         for _ in range(M):
             row += 1
             gradient = sum(
-                oracle.critic_action_gradient(c, np.broadcast_to(observation, (*action.shape[:2], OBS)), action, level)
-                for c in critics
-            )  # fmt: skip
+                oracle.critic_action_gradient(critic, states, action, level) for critic in critics
+            )
             gradient = oracle.normalize(gradient) if unit else gradient
             action = action + eps / 2 * 20 * gradient + np.sqrt(eps) * noise[row].numpy()
             action = np.clip(action, -1, 1)

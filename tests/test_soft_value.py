@@ -38,7 +38,8 @@ def test_it_is_the_best_of_all_without_temperature_and_their_mean_with_much():
 
 
 def test_two_candidates_by_hand():
-    values = torch.tensor([[[1.0, 3.0]], [[2.0, 0.0]]])  # minima 1 and 0; log((e + 1) / 2) = 0.62011
+    values = torch.tensor([[[1.0, 3.0]], [[2.0, 0.0]]])  # the smaller ones are 1 and 0
+    # log((e + 1) / 2) = 0.62011
     assert F.soft_value(values, 1.0).item() == pytest.approx(0.62011, abs=1e-5)
 
 

@@ -98,6 +98,8 @@ class CriticGuidedDenoisingActor(ChainPolicy):
     """
 
     guidance_weight: Tensor
+    schedule: Any
+    chain_schedule: Any
 
     def __init__(
         self,

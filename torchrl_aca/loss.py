@@ -54,9 +54,9 @@ class ACALoss(OpenLoopAlpha, TDLoss):
         qvalue_network: may be passed for symmetry with TorchRL's losses; must be the actor's
             critic.
         num_target_candidates: ``N`` of ``a'_0``. Default: the actor's ``num_candidates``.
-        target_value: value of the next state: of the ``"best"`` candidate (paper), or the ``"soft"``
-            value of all of them, ``tau log mean_n exp(min_i Q_bar_i(s', a'_n, 0) / tau)``, each
-            with exploration noise of its own. Default: ``"best"``.
+        target_value: value of the next state: of the ``"best"`` candidate (paper), or the
+            ``"soft"`` value of all of them, each with exploration noise of its own:
+            ``tau log mean_n exp(min_i Q_bar_i(s', a'_n, 0) / tau)``. Default: ``"best"``.
         temperature: ``tau`` of the soft value, in scaled reward. Default: 0.1.
         guidance_weight: ``"fixed"``, or ``"auto"`` for :meth:`step_guidance_weight`, which moves
             the actor's ``w`` from where it is; it needs two target candidates or more. Default:
@@ -84,8 +84,8 @@ class ACALoss(OpenLoopAlpha, TDLoss):
             always. Default: True.
 
     Random draws are taken from the input where it has them: ``noise_level`` (from ``1..T``),
-    ``noise`` (standard normal, shape of the action) and ``next_action`` (``a'_0`` in env units, with
-    ``target_value="soft"`` all of them, of shape ``(*batch, N, A)``).
+    ``noise`` (standard normal, shape of the action) and ``next_action`` (``a'_0`` in env units; all
+    of them, of shape ``(*batch, N, A)``, with ``target_value="soft"``).
     Where replay data hold entries of these names that mean something else, rename what the loss
     looks for with :meth:`set_keys`, or pass ``use_given_draws=False``.
 

@@ -34,11 +34,11 @@ Candidates = Annotated[int, Field(ge=1, le=10**5)]
 
 
 # A number, or "auto"; a union of the two would tell a mistake twice.
-AutoOr = (
+Weight = Annotated[
+    NonNegative,
     WrapValidator(lambda value, number: value if value == "auto" else number(value)),
     PlainSerializer(lambda value: value),
-)
-
+]
 
 
 class ACASettings(Section):
@@ -53,7 +53,7 @@ class ACASettings(Section):
     first_level: Annotated[int, Field(ge=0, le=1)]
     target_value: Literal["best", "soft"]
     temperature: Positive
-    guidance_weight: Annotated[NonNegative, *AutoOr]
+    guidance_weight: Weight
     guidance_weight_init: Positive
     guidance_weight_lr: Positive
     num_candidates: Candidates
@@ -163,7 +163,9 @@ def make_aca(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
         batch = batch.copy()
         batch[loss.tensor_keys.next_action] = loss.sample_next_action(batch)
         metrics = descend(qvalue_loss(batch), "loss_qvalue", optimizer)
-        return metrics.update(loss.step_guidance_weight(batch)) if settings.auto_guidance else metrics
+        if settings.auto_guidance:
+            metrics.update(loss.step_guidance_weight(batch))
+        return metrics
 
     @partial(capture, enabled=cfg.cudagraphs)
     def noise_level_step(batch: TensorDictBase) -> TensorDictBase:
