@@ -1,7 +1,7 @@
 """What ACA's paper leaves open, on its 2D bandit: a guidance weight that tunes itself, soft values.
 
     python recipes/bandit_beyond.py
-    python recipes/bandit_beyond.py ablation.training={} seeds=[0]
+    python recipes/bandit_beyond.py seeds=[0] "ablation.training={beyond.reward_scale: [1.0]}"
 
 Two tables:
 
@@ -80,7 +80,8 @@ def soft_rows(cfg: BeyondConfig, actor: CriticGuidedDenoisingActor) -> Iterator[
     features = actor.encode(torch.zeros(num_states, 1), [num_states])
     draws = actor.draws(num_states, settings.num_proposals)
     candidates = actor.propose(features, draws[:-1])
-    known, learnt = reward(candidates)[..., None], actor.values(features, candidates)
+    known = settings.reward_scale * reward(candidates)[..., None]
+    learnt = actor.values(features, candidates)
     for temperature in settings.temperatures:
         values = {
             "critic": F.soft_value(learnt, temperature),
