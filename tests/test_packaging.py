@@ -42,6 +42,7 @@ ALLOWED = {
         "critic",
         "custom_critic",
     },
+    "langevin_actor": {"checks", "schedule", "chain", "actor"},
     "td_loss": {"checks", "functional"},
     "loss": {
         "checks",

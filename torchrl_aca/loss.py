@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -16,11 +17,13 @@ from torchrl.objectives.utils import distance_loss
 
 from torchrl_aca import functional as F
 from torchrl_aca.actor import CriticGuidedDenoisingActor
-from torchrl_aca.checks import check_at_least, check_choice
+from torchrl_aca.checks import check_above, check_at_least, check_choice
 from torchrl_aca.critic import NoiseLevelCriticBase
 from torchrl_aca.td_loss import OpenLoopAlpha, TDLoss, next_key
 
 __all__ = ["ACALoss"]
+
+LOG_STEP = 0.1  # half the difference in log w by which the automatic guidance weight looks about
 
 
 class ACALoss(OpenLoopAlpha, TDLoss):
@@ -51,8 +54,20 @@ class ACALoss(OpenLoopAlpha, TDLoss):
         qvalue_network: may be passed for symmetry with TorchRL's losses; must be the actor's
             critic.
         num_target_candidates: ``N`` of ``a'_0``. Default: the actor's ``num_candidates``.
-        noise_level_target: ``"mean"`` over the critics (official code) or each critic's own value,
-            ``"self"`` (paper). Default: ``"mean"``.
+        target_value: value of the next state: of the ``"best"`` candidate (paper), or the
+            ``"soft"`` value of all of them, each with exploration noise of its own:
+            ``tau log mean_n exp(min_i Q_bar_i(s', a'_n, 0) / tau)``. Default: ``"best"``.
+        temperature: ``tau`` of the soft value, in scaled reward. Default: 0.1.
+        guidance_weight: ``"fixed"``, or ``"auto"`` for :meth:`step_guidance_weight`, which moves
+            the actor's ``w`` from where it is; it needs two target candidates or more. Default:
+            ``"fixed"``, the paper.
+        guidance_weight_lr: rate of the steps on ``log w``. Default: 0.01.
+        target_spread: standard deviation below which those steps do not press the candidates, in
+            critic units, or ``"auto"`` for that of a Gaussian of the target entropy,
+            ``exp(H_target / A) / sqrt(2 pi e)``. Default: ``"auto"``.
+        noise_level_target: ``"mean"`` over the critics (official code), each critic's own value,
+            ``"self"`` (paper), or ``"target"``, the mean over the target critics (NC-LQL). Default:
+            ``"mean"``.
         target_entropy: ``H_target`` in nats, or ``"auto"`` for ``-target_entropy_scale * A``.
         target_entropy_scale: default 0.9.
         entropy_noise_scale: the noise scale inside ``H``. The official code has 0.1 here whatever
@@ -69,7 +84,8 @@ class ACALoss(OpenLoopAlpha, TDLoss):
             always. Default: True.
 
     Random draws are taken from the input where it has them: ``noise_level`` (from ``1..T``),
-    ``noise`` (standard normal, shape of the action) and ``next_action`` (``a'_0`` in env units).
+    ``noise`` (standard normal, shape of the action) and ``next_action`` (``a'_0`` in env units; all
+    of them, of shape ``(*batch, N, A)``, with ``target_value="soft"``).
     Where replay data hold entries of these names that mean something else, rename what the loss
     looks for with :meth:`set_keys`, or pass ``use_given_draws=False``.
 
@@ -95,6 +111,8 @@ class ACALoss(OpenLoopAlpha, TDLoss):
             noise_level: optional given noise levels.
             noise: optional given noise of the noise-level loss.
             next_action: optional given next action, in env units.
+            candidate_spread: where the spread of the target's candidates is written.
+            guidance_gain: where their gain by more guidance is written.
             priority: where the TD error for prioritised replay is written.
             reward: the reward, below ``"next"``.
             done: the done flag, below ``"next"``.
@@ -108,6 +126,8 @@ class ACALoss(OpenLoopAlpha, TDLoss):
         noise_level: NestedKey = "noise_level"
         noise: NestedKey = "noise"
         next_action: NestedKey = "next_action"
+        candidate_spread: NestedKey = "candidate_spread"
+        guidance_gain: NestedKey = "guidance_gain"
         priority: NestedKey = "td_error"
         reward: NestedKey = "reward"
         done: NestedKey = "done"
@@ -140,7 +160,12 @@ class ACALoss(OpenLoopAlpha, TDLoss):
         *,
         qvalue_network: nn.Module | None = None,
         num_target_candidates: int | None = None,
-        noise_level_target: Literal["mean", "self"] = "mean",
+        target_value: Literal["best", "soft"] = "best",
+        temperature: float = 0.1,
+        guidance_weight: Literal["fixed", "auto"] = "fixed",
+        guidance_weight_lr: float = 0.01,
+        target_spread: float | Literal["auto"] = "auto",
+        noise_level_target: Literal["mean", "self", "target"] = "mean",
         target_entropy: float | Literal["auto"] = "auto",
         target_entropy_scale: float = 0.9,
         entropy_noise_scale: float = 0.1,
@@ -158,16 +183,26 @@ class ACALoss(OpenLoopAlpha, TDLoss):
                 "qvalue_network must be actor_network.critic: in ACA the critic is the actor. "
                 "Leave it out, or build the actor with this network."
             )
-        check_choice(("mean", "self"), noise_level_target=noise_level_target)
+        check_choice(("mean", "self", "target"), noise_level_target=noise_level_target)
         if num_target_candidates is None:
             num_target_candidates = actor_network.num_candidates
         check_at_least(1, num_target_candidates=num_target_candidates)
+        check_choice(("best", "soft"), target_value=target_value)
+        check_above(0, temperature=temperature)
+        check_choice(("fixed", "auto"), guidance_weight=guidance_weight)
+        check_above(0, guidance_weight_lr=guidance_weight_lr)
+        if guidance_weight == "auto":
+            check_at_least(2, num_target_candidates=num_target_candidates)
+            check_above(0, guidance_weight_of_the_actor=float(actor_network.guidance_weight))
         # The actor is no submodule: its parameters are listed below, and only once.
         self.__dict__["actor_network"] = actor_network
         self.convert_to_functional(critic, "qvalue_network", create_target_params=delay_qvalue)
         self.register_buffer("guidance_weight", actor_network.guidance_weight)
         self.delay_qvalue = delay_qvalue
         self.num_target_candidates = num_target_candidates
+        self.target_value, self.temperature = target_value, temperature
+        self.auto_guidance = guidance_weight == "auto"
+        self.guidance_weight_lr = guidance_weight_lr
         self.noise_level_target = noise_level_target
         self.reward_scale = reward_scale
         self.loss_function = loss_function
@@ -175,6 +210,12 @@ class ACALoss(OpenLoopAlpha, TDLoss):
         self.use_prioritized_weights = use_prioritized_weights
         self.use_given_draws = use_given_draws
         self._init_alpha(target_entropy, target_entropy_scale, entropy_noise_scale)
+        if target_spread == "auto":
+            std = F.entropy_std(self.target_entropy, actor_network.action_dim)
+        else:
+            check_above(0, target_spread=target_spread)
+            std = self.target_entropy.new_tensor(target_spread)
+        self.register_buffer("target_spread", std, persistent=False)
         self.set_keys(
             action=actor_network.out_keys[0],
             state_action_value=critic.value_key,
@@ -210,14 +251,36 @@ class ACALoss(OpenLoopAlpha, TDLoss):
         noisy_action = schedule.add_noise(action, noise, level)
         with self._critics(self.qvalue_network_params):
             features = self.actor_network.encode(observation, action.shape[:-1])
-            with torch.no_grad():
-                clean_value = self._values(features, action, self._clean_level(action))
+            clean_value = self._clean_value(features, observation, action)
             value = self._values(features, noisy_action, level)
         target = F.noise_level_target(clean_value, self.noise_level_target)
         error = distance_loss(value, target, self.loss_function).sum(-1)
         metrics = {"noisy_value": value.detach().mean()}
         weights = self._maybe_get_priority_weight(tensordict)
         return self._output("loss_noise_level", error, tensordict, metrics, weights)
+
+    @torch.no_grad()
+    def step_guidance_weight(self, tensordict: TensorDictBase) -> TensorDict:
+        """Move ``log w`` by ``guidance_weight_lr`` times :func:`~.functional.guidance_step`.
+
+        Args:
+            tensordict: a batch that :meth:`qvalue_loss` or :meth:`sample_next_action` has seen,
+                with ``guidance_weight="auto"``: they write what is read here.
+
+        Returns:
+            The metrics ``guidance_weight``, ``candidate_spread`` and ``guidance_gain``.
+
+        Raises:
+            KeyError: if they have not written it.
+        """
+        keys = self.tensor_keys
+        spread = tensordict[keys.candidate_spread].square().mean().sqrt()
+        gain = tensordict[keys.guidance_gain].mean()
+        step = self.guidance_weight_lr * F.guidance_step(spread, self.target_spread, gain)
+        # In place: actor, loss and whoever else holds the weight see the new one.
+        self.guidance_weight.mul_(step.exp())
+        metrics = {"candidate_spread": spread, "guidance_gain": gain}
+        return TensorDict({"guidance_weight": self.guidance_weight.to(spread.dtype), **metrics})
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
@@ -239,14 +302,41 @@ class ACALoss(OpenLoopAlpha, TDLoss):
     def sample_next_action(self, tensordict: TensorDictBase) -> Tensor:
         """Draws ``a'_0`` of the target, in env units, shape ``(*batch, A)``.
 
+        With ``target_value="soft"`` it is all candidates, of shape ``(*batch, N, A)``.
+
         :meth:`qvalue_loss` does so by itself where the input has no ``next_action``. Drawn
-        beforehand, it lets the rest of the loss be compiled without the chain.
+        beforehand, it lets the rest of the loss be compiled without the chain. With
+        ``guidance_weight="auto"`` it writes the spread of the candidates and their gain by more
+        guidance to ``tensordict``, both of shape ``(*batch,)``.
         """
-        observation = [tensordict[next_key(key)] for key in self.actor_network.in_keys]
+        actor = self.actor_network
+        observation = [tensordict[next_key(key)] for key in actor.in_keys]
         batch = tensordict[self.tensor_keys.action].shape[:-1]
-        return self.actor_network.sample(
-            observation, batch, num_candidates=self.num_target_candidates
-        )
+        features = actor.encode(observation, batch)
+        draws = actor.draws(batch.numel(), self.num_target_candidates)
+        candidates = self._candidates(features, draws[:-1])
+        soft = self.target_value == "soft"
+        if self.auto_guidance or not soft:
+            values = actor.values(features, candidates)
+        if self.auto_guidance:
+            spread = F.candidate_spread(candidates)
+            gain = F.guidance_gain(values, 2 * LOG_STEP)
+            tensordict.set(self.tensor_keys.candidate_spread, spread.reshape(batch))
+            tensordict.set(self.tensor_keys.guidance_gain, gain.reshape(batch))
+        if soft:
+            action = actor.explore(candidates, draws[-1]).movedim(0, 1)
+        else:
+            action = actor.explore(F.select_best(candidates, values), draws[-1, 0])
+        return actor.to_env(action).reshape(*batch, *action.shape[1:])
+
+    def _candidates(self, features: Any, noise: Tensor) -> Tensor:
+        """The target's candidates ``(N, B, A)``; to tune ``w``, from a little above and below."""
+        actor = self.actor_network
+        if not self.auto_guidance:
+            return actor.propose(features, noise)
+        weights = [self.guidance_weight * math.exp(sign * LOG_STEP) for sign in (1, -1)]
+        halves = zip(noise.tensor_split(2, dim=1), weights, strict=True)
+        return torch.cat([actor.propose(features, half, weight) for half, weight in halves])
 
     @torch.no_grad()
     def _target_value(self, tensordict: TensorDictBase) -> Tensor:
@@ -257,11 +347,31 @@ class ACALoss(OpenLoopAlpha, TDLoss):
         if next_action is None:
             next_action = self.sample_next_action(tensordict)
         next_action = actor.from_env(next_action)
+        batch = tensordict[keys.action].shape[:-1]
         with self._critics(self._target_params()):
-            features = actor.encode(observation, next_action.shape[:-1])
-            next_values = self._values(features, next_action, self._clean_level(next_action))
-        next_value = next_values.amin(-1, keepdim=True)
+            features = actor.encode(observation, batch)
+            if self.target_value == "soft":
+                next_value = self._soft_value(features, next_action).reshape(*batch, 1)
+            else:
+                next_values = self._values(features, next_action, self._clean_level(next_action))
+                next_value = next_values.amin(-1, keepdim=True)
         return self._td_target(tensordict, next_value, self.reward_scale)
+
+    def _soft_value(self, features: Any, actions: Tensor) -> Tensor:
+        """Soft value ``(B,)`` of actions ``(*batch, N, A)``, in one pass over ``N B`` rows."""
+        candidates = actions.reshape(-1, *actions.shape[-2:]).movedim(1, 0)
+        level = torch.zeros((), dtype=torch.long, device=actions.device)
+        values = self.qvalue_network.evaluate(features, candidates, level)
+        return F.soft_value(values, self.temperature)
+
+    @torch.no_grad()
+    def _clean_value(self, features: Any, observation: list[Tensor], action: Tensor) -> Tensor:
+        """What the noisy levels learn, ``(*batch, E)``: by the online critics or their targets."""
+        if self.noise_level_target != "target":
+            return self._values(features, action, self._clean_level(action))
+        with self._critics(self._target_params()):
+            features = self.actor_network.encode(observation, action.shape[:-1])
+            return self._values(features, action, self._clean_level(action))
 
     def _state_and_action(self, tensordict: TensorDictBase) -> tuple[list[Tensor], Tensor]:
         """Observations as they are, and the action in critic units."""

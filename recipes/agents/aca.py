@@ -6,7 +6,7 @@ from functools import partial
 from typing import Annotated, Any, Literal
 
 import torch
-from pydantic import Field, model_validator
+from pydantic import Field, PlainSerializer, WrapValidator, model_validator
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.objectives import SoftUpdate
@@ -33,6 +33,14 @@ SCHEDULES = {
 Candidates = Annotated[int, Field(ge=1, le=10**5)]
 
 
+# A number, or "auto"; a union of the two would tell a mistake twice.
+Weight = Annotated[
+    NonNegative,
+    WrapValidator(lambda value, number: value if value == "auto" else number(value)),
+    PlainSerializer(lambda value: value),
+]
+
+
 class ACASettings(Section):
     """The section `aca`."""
 
@@ -43,7 +51,11 @@ class ACASettings(Section):
     num_cells: Widths
     num_critics: Annotated[int, Field(ge=1, le=1000)]
     first_level: Annotated[int, Field(ge=0, le=1)]
-    guidance_weight: NonNegative
+    target_value: Literal["best", "soft"]
+    temperature: Positive
+    guidance_weight: Weight
+    guidance_weight_init: Positive
+    guidance_weight_lr: Positive
     num_candidates: Candidates
     num_target_candidates: Candidates
     exploration_noise: Annotated[float, Field(ge=0, le=1e3)]  # of actions in [-1, 1]
@@ -60,7 +72,14 @@ class ACASettings(Section):
             self.refuse("num_inference_steps", f"at most aca.num_steps ({self.num_steps})")
         if self.inference_levels is not None:
             self._check_levels(self.inference_levels)
+        if self.auto_guidance and self.num_target_candidates < 2:
+            self.refuse("num_target_candidates", "at least 2 beside aca.guidance_weight=auto")
         return self
+
+    @property
+    def auto_guidance(self) -> bool:
+        """Whether the guidance weight tunes itself."""
+        return self.guidance_weight == "auto"
 
     def _check_levels(self, levels: list[int]) -> None:
         """They replace `num_inference_steps`, which then holds its default or their number."""
@@ -82,7 +101,7 @@ class ACAOptim(DecayOptim):
 
 def make_aca_loss(cfg: Any, env: EnvBase, device: torch.device) -> ACALoss:
     """The critic, the actor that it guides, and their loss."""
-    settings, levels = cfg.aca, cfg.aca.inference_levels
+    settings, levels, auto = cfg.aca, cfg.aca.inference_levels, cfg.aca.auto_guidance
     action_spec = env.action_spec_unbatched
     critic = NoiseLevelCritic(
         env.observation_spec["observation"].shape[-1],
@@ -97,7 +116,7 @@ def make_aca_loss(cfg: Any, env: EnvBase, device: torch.device) -> ACALoss:
         critic,
         SCHEDULES[settings.schedule](settings.num_steps),
         spec=action_spec,
-        guidance_weight=settings.guidance_weight,
+        guidance_weight=settings.guidance_weight_init if auto else settings.guidance_weight,
         num_candidates=settings.num_candidates,
         num_inference_steps=settings.num_inference_steps if levels is None else None,
         inference_levels=levels,
@@ -109,6 +128,10 @@ def make_aca_loss(cfg: Any, env: EnvBase, device: torch.device) -> ACALoss:
     loss = ACALoss(
         actor,
         num_target_candidates=settings.num_target_candidates,
+        target_value=settings.target_value,
+        temperature=settings.temperature,
+        guidance_weight="auto" if auto else "fixed",
+        guidance_weight_lr=settings.guidance_weight_lr,
         noise_level_target=settings.noise_level_target,
         target_entropy_scale=settings.target_entropy_scale,
         reward_scale=settings.reward_scale,
@@ -139,7 +162,10 @@ def make_aca(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
     def td_step(batch: TensorDictBase) -> TensorDictBase:
         batch = batch.copy()
         batch[loss.tensor_keys.next_action] = loss.sample_next_action(batch)
-        return descend(qvalue_loss(batch), "loss_qvalue", optimizer)
+        metrics = descend(qvalue_loss(batch), "loss_qvalue", optimizer)
+        if settings.auto_guidance:
+            metrics.update(loss.step_guidance_weight(batch))
+        return metrics
 
     @partial(capture, enabled=cfg.cudagraphs)
     def noise_level_step(batch: TensorDictBase) -> TensorDictBase:
