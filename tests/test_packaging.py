@@ -44,6 +44,7 @@ ALLOWED = {
     },
     "langevin_actor": {"checks", "schedule", "chain", "actor"},
     "td_loss": {"checks", "functional"},
+    "tuning": {"checks", "functional"},
     "loss": {
         "checks",
         "functional",
@@ -53,6 +54,7 @@ ALLOWED = {
         "custom_critic",
         "actor",
         "td_loss",
+        "tuning",
     },
     "interop": {"functional", "critic"},
     "trainer": {"checks"},
@@ -67,6 +69,7 @@ ROOMS = {
         "chain",
         "chain_policy",
         "td_loss",
+        "tuning",
     },
     "replay": {"checks", "errors"},
     "offline": {"checks", "errors", "replay"},

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -19,14 +18,13 @@ from torchrl_aca import functional as F
 from torchrl_aca.actor import CriticGuidedDenoisingActor
 from torchrl_aca.checks import check_above, check_at_least, check_choice
 from torchrl_aca.critic import NoiseLevelCriticBase
-from torchrl_aca.td_loss import OpenLoopAlpha, TDLoss, next_key
+from torchrl_aca.td_loss import TDLoss, next_key
+from torchrl_aca.tuning import AutoGuidance, OpenLoopAlpha
 
 __all__ = ["ACALoss"]
 
-LOG_STEP = 0.1  # half the difference in log w by which the automatic guidance weight looks about
 
-
-class ACALoss(OpenLoopAlpha, TDLoss):
+class ACALoss(OpenLoopAlpha, AutoGuidance, TDLoss):
     """Loss module of *Actor-Critic without Actor* (arXiv 2509.21022).
 
     Three losses, each to be had alone as a TensorDict of its ``loss_*`` entry and metrics:
@@ -189,20 +187,12 @@ class ACALoss(OpenLoopAlpha, TDLoss):
         check_at_least(1, num_target_candidates=num_target_candidates)
         check_choice(("best", "soft"), target_value=target_value)
         check_above(0, temperature=temperature)
-        check_choice(("fixed", "auto"), guidance_weight=guidance_weight)
-        check_above(0, guidance_weight_lr=guidance_weight_lr)
-        if guidance_weight == "auto":
-            check_at_least(2, num_target_candidates=num_target_candidates)
-            check_above(0, guidance_weight_of_the_actor=float(actor_network.guidance_weight))
         # The actor is no submodule: its parameters are listed below, and only once.
         self.__dict__["actor_network"] = actor_network
         self.convert_to_functional(critic, "qvalue_network", create_target_params=delay_qvalue)
-        self.register_buffer("guidance_weight", actor_network.guidance_weight)
         self.delay_qvalue = delay_qvalue
         self.num_target_candidates = num_target_candidates
         self.target_value, self.temperature = target_value, temperature
-        self.auto_guidance = guidance_weight == "auto"
-        self.guidance_weight_lr = guidance_weight_lr
         self.noise_level_target = noise_level_target
         self.reward_scale = reward_scale
         self.loss_function = loss_function
@@ -210,12 +200,7 @@ class ACALoss(OpenLoopAlpha, TDLoss):
         self.use_prioritized_weights = use_prioritized_weights
         self.use_given_draws = use_given_draws
         self._init_alpha(target_entropy, target_entropy_scale, entropy_noise_scale)
-        if target_spread == "auto":
-            std = F.entropy_std(self.target_entropy, actor_network.action_dim)
-        else:
-            check_above(0, target_spread=target_spread)
-            std = self.target_entropy.new_tensor(target_spread)
-        self.register_buffer("target_spread", std, persistent=False)
+        self._init_guidance(guidance_weight, guidance_weight_lr, target_spread)
         self.set_keys(
             action=actor_network.out_keys[0],
             state_action_value=critic.value_key,
@@ -259,29 +244,6 @@ class ACALoss(OpenLoopAlpha, TDLoss):
         weights = self._maybe_get_priority_weight(tensordict)
         return self._output("loss_noise_level", error, tensordict, metrics, weights)
 
-    @torch.no_grad()
-    def step_guidance_weight(self, tensordict: TensorDictBase) -> TensorDict:
-        """Move ``log w`` by ``guidance_weight_lr`` times :func:`~.functional.guidance_step`.
-
-        Args:
-            tensordict: a batch that :meth:`qvalue_loss` or :meth:`sample_next_action` has seen,
-                with ``guidance_weight="auto"``: they write what is read here.
-
-        Returns:
-            The metrics ``guidance_weight``, ``candidate_spread`` and ``guidance_gain``.
-
-        Raises:
-            KeyError: if they have not written it.
-        """
-        keys = self.tensor_keys
-        spread = tensordict[keys.candidate_spread].square().mean().sqrt()
-        gain = tensordict[keys.guidance_gain].mean()
-        step = self.guidance_weight_lr * F.guidance_step(spread, self.target_spread, gain)
-        # In place: actor, loss and whoever else holds the weight see the new one.
-        self.guidance_weight.mul_(step.exp())
-        metrics = {"candidate_spread": spread, "guidance_gain": gain}
-        return TensorDict({"guidance_weight": self.guidance_weight.to(spread.dtype), **metrics})
-
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """All three losses and their metrics; see the class."""
@@ -319,24 +281,12 @@ class ACALoss(OpenLoopAlpha, TDLoss):
         if self.auto_guidance or not soft:
             values = actor.values(features, candidates)
         if self.auto_guidance:
-            spread = F.candidate_spread(candidates)
-            gain = F.guidance_gain(values, 2 * LOG_STEP)
-            tensordict.set(self.tensor_keys.candidate_spread, spread.reshape(batch))
-            tensordict.set(self.tensor_keys.guidance_gain, gain.reshape(batch))
+            self._note_guidance(tensordict, candidates, values)
         if soft:
             action = actor.explore(candidates, draws[-1]).movedim(0, 1)
         else:
             action = actor.explore(F.select_best(candidates, values), draws[-1, 0])
         return actor.to_env(action).reshape(*batch, *action.shape[1:])
-
-    def _candidates(self, features: Any, noise: Tensor) -> Tensor:
-        """The target's candidates ``(N, B, A)``; to tune ``w``, from a little above and below."""
-        actor = self.actor_network
-        if not self.auto_guidance:
-            return actor.propose(features, noise)
-        weights = [self.guidance_weight * math.exp(sign * LOG_STEP) for sign in (1, -1)]
-        halves = zip(noise.tensor_split(2, dim=1), weights, strict=True)
-        return torch.cat([actor.propose(features, half, weight) for half, weight in halves])
 
     @torch.no_grad()
     def _target_value(self, tensordict: TensorDictBase) -> Tensor:
@@ -392,7 +342,7 @@ class ACALoss(OpenLoopAlpha, TDLoss):
         """The actor holds the loss's parameters and buffers."""
         super()._tie()
         self._tie_alpha()
-        self.guidance_weight = self.actor_network.guidance_weight
+        self._tie_guidance()
 
     def _apply(self, fn: Callable) -> ACALoss:
         """Take the actor along."""
