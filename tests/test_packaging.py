@@ -55,6 +55,7 @@ ALLOWED = {
     },
     "interop": {"functional", "critic"},
     "trainer": {"checks"},
+    "make": {"checks", "schedule", "critic", "actor"},
 }
 # What each room may import besides itself.
 ROOMS = {

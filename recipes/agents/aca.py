@@ -12,7 +12,7 @@ from torchrl.envs import EnvBase
 from torchrl.objectives import SoftUpdate
 
 from agents.learning_rate import DecayOptim, linear_decay
-from torchrl_aca import ACALoss, CriticGuidedDenoisingActor, NoiseLevelCritic, NoiseSchedule
+from torchrl_aca import ACALoss, CriticGuidedDenoisingActor, make_aca_actor
 from torchrl_aca.chain import check_levels
 from torchrl_aca.training.acceleration import capture, compiled, descend, make_adam
 from torchrl_aca.training.agent import Agent
@@ -24,12 +24,8 @@ from torchrl_aca.training.config import (
     Section,
     Widths,
 )
+from torchrl_aca.training.policy import PolicyBuilder
 
-SCHEDULES = {
-    "cosine": NoiseSchedule.cosine,
-    "linear": NoiseSchedule.linear,
-    "vp": NoiseSchedule.vp,
-}
 Candidates = Annotated[int, Field(ge=1, le=10**5)]
 
 
@@ -80,23 +76,17 @@ class ACAOptim(DecayOptim):
     alpha_lr: Positive
 
 
-def make_aca_loss(cfg: Any, env: EnvBase, device: torch.device) -> ACALoss:
-    """The critic, the actor that it guides, and their loss."""
+def aca_policy(cfg: Any, env: EnvBase) -> PolicyBuilder:
+    """The actor with the critic that guides it."""
     settings, levels = cfg.aca, cfg.aca.inference_levels
-    action_spec = env.action_spec_unbatched
-    critic = NoiseLevelCritic(
-        env.observation_spec["observation"].shape[-1],
-        action_spec.shape[-1],
+    return PolicyBuilder.of(
+        env,
+        make_aca_actor,
         num_steps=settings.num_steps,
+        schedule=settings.schedule,
         num_critics=settings.num_critics,
         num_cells=settings.num_cells,
         first_level=settings.first_level,
-        device=device,
-    )
-    actor = CriticGuidedDenoisingActor(
-        critic,
-        SCHEDULES[settings.schedule](settings.num_steps),
-        spec=action_spec,
         guidance_weight=settings.guidance_weight,
         num_candidates=settings.num_candidates,
         num_inference_steps=settings.num_inference_steps if levels is None else None,
@@ -104,8 +94,12 @@ def make_aca_loss(cfg: Any, env: EnvBase, device: torch.device) -> ACALoss:
         exploration_noise=settings.exploration_noise,
         alpha_init=settings.alpha_init,
         deterministic_draws=cfg.eval.draws,
-        compile_step=cfg.compile,
-    ).to(device)
+    )
+
+
+def make_aca_loss(cfg: Any, actor: CriticGuidedDenoisingActor) -> ACALoss:
+    """The loss of the actor's critic."""
+    settings = cfg.aca
     loss = ACALoss(
         actor,
         num_target_candidates=settings.num_target_candidates,
@@ -124,7 +118,8 @@ def make_aca(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
     what changes from update to update, which of them to take and the learning rate, stays outside.
     """
     settings, optim = cfg.aca, cfg.optim
-    loss = make_aca_loss(cfg, env, device)
+    builder = aca_policy(cfg, env)
+    loss = make_aca_loss(cfg, builder.build(device, compile_step=cfg.compile))
     target_update = SoftUpdate(loss, tau=optim.tau)
     optimizer = make_adam(loss.qvalue_network.parameters(), optim.lr, cfg.cudagraphs)
     alpha_optimizer = make_adam([loss.log_alpha], optim.alpha_lr, cfg.cudagraphs)
@@ -175,4 +170,5 @@ def make_aca(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
             "scheduler": scheduler,
             "progress": progress,
         },
+        policy_builder=builder,
     )

@@ -101,6 +101,7 @@ class Checkpoint(Section):
 
     interval: Count
     keep_last: Count
+    keep_best: bool = True  # runs from before it was a key resume
 
 
 class Logger(Section):
