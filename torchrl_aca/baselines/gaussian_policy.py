@@ -31,6 +31,9 @@ class BoundedNormalParams(nn.Module):
 class FreeStd(nn.Module):
     """Puts a mean in [-1, 1] into env units, beside a standard deviation that no state changes."""
 
+    centre: Tensor
+    half_range: Tensor
+
     def __init__(self, action_spec: Bounded, log_std_min: float, log_std_max: float) -> None:
         """Begins with a standard deviation of half the action's range."""
         super().__init__()

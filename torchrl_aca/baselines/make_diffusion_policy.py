@@ -59,12 +59,13 @@ def make_diffusion_policy(
         >>> policy(TensorDict(observation=torch.zeros(3, 17), batch_size=[3]))["action"].shape
         torch.Size([3, 6])
     """
-    sizes = observation_dim, spec.shape[-1]
-    mlp = {"num_cells": num_cells, "activation": getattr(nn, activation), "device": device}
+    action_dim = spec.shape[-1]
+    kind = getattr(nn, activation)
+    mlp: dict[str, Any] = {"num_cells": num_cells, "activation": kind, "device": device}
     return DiffusionPolicy(
-        NoiseNetwork(*sizes, num_steps=num_steps, **mlp, **(network or {})),
+        NoiseNetwork(observation_dim, action_dim, num_steps=num_steps, **mlp, **(network or {})),
         _chain(schedule, num_steps, linear_scale),
-        critic=TwinCritic(*sizes, **mlp, **(critic or {})),
+        critic=TwinCritic(observation_dim, action_dim, **mlp, **(critic or {})),
         spec=spec,
         **policy,
     ).to(device)
