@@ -1,4 +1,4 @@
-"""Trained policies in use: from runs that the real recipe wrote, in a process that has no recipe."""
+"""Trained policies in use: of runs that the real recipe wrote, in a process without a recipe."""
 
 from __future__ import annotations
 
@@ -195,7 +195,7 @@ def test_a_file_names_public_factories_of_the_package_alone(saved):
     [
         (
             {"format": "torchrl-aca policy 0"},
-            "expected 'torchrl-aca policy 1', got 'torchrl-aca po",
+            "expected 'torchrl-aca policy 1', got",
         ),
         ({"settings": None}, "has no settings: expected a dict, got NoneType"),
         ({"settings": {"num_cells": [9], "num_steps": 3}}, "cannot be built with .*size mismatch"),
