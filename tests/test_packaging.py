@@ -55,7 +55,7 @@ ALLOWED = {
     },
     "interop": {"functional", "critic"},
     "trainer": {"checks"},
-    "make": {"checks", "schedule", "critic", "actor"},
+    "make": {"checks", "schedule", "critic", "actor", "loss"},
 }
 # What each room may import besides itself.
 ROOMS = {

@@ -9,10 +9,10 @@ import torch
 from pydantic import Field, model_validator
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
-from torchrl.objectives import SoftUpdate
 
+import torchrl_aca
 from agents.learning_rate import DecayOptim, linear_decay
-from torchrl_aca import ACALoss, CriticGuidedDenoisingActor, make_aca_actor
+from torchrl_aca import make_aca_actor
 from torchrl_aca.chain import check_levels
 from torchrl_aca.training.acceleration import capture, compiled, descend, make_adam
 from torchrl_aca.training.agent import Agent
@@ -76,39 +76,23 @@ class ACAOptim(DecayOptim):
     alpha_lr: Positive
 
 
-def aca_policy(cfg: Any, env: EnvBase) -> PolicyBuilder:
-    """The actor with the critic that guides it."""
+def actor_settings(cfg: Any) -> dict[str, Any]:
+    """The keywords of `make_aca_actor`."""
     settings, levels = cfg.aca, cfg.aca.inference_levels
-    return PolicyBuilder.of(
-        env,
-        make_aca_actor,
-        num_steps=settings.num_steps,
-        schedule=settings.schedule,
-        num_critics=settings.num_critics,
-        num_cells=settings.num_cells,
-        first_level=settings.first_level,
-        guidance_weight=settings.guidance_weight,
-        num_candidates=settings.num_candidates,
-        num_inference_steps=settings.num_inference_steps if levels is None else None,
-        inference_levels=levels,
-        exploration_noise=settings.exploration_noise,
-        alpha_init=settings.alpha_init,
-        deterministic_draws=cfg.eval.draws,
-    )
-
-
-def make_aca_loss(cfg: Any, actor: CriticGuidedDenoisingActor) -> ACALoss:
-    """The loss of the actor's critic."""
-    settings = cfg.aca
-    loss = ACALoss(
-        actor,
-        num_target_candidates=settings.num_target_candidates,
-        noise_level_target=settings.noise_level_target,
-        target_entropy_scale=settings.target_entropy_scale,
-        reward_scale=settings.reward_scale,
-    )
-    loss.make_value_estimator(gamma=cfg.optim.gamma)
-    return loss
+    return {
+        "num_steps": settings.num_steps,
+        "schedule": settings.schedule,
+        "num_critics": settings.num_critics,
+        "num_cells": settings.num_cells,
+        "first_level": settings.first_level,
+        "guidance_weight": settings.guidance_weight,
+        "num_candidates": settings.num_candidates,
+        "num_inference_steps": settings.num_inference_steps if levels is None else None,
+        "inference_levels": levels,
+        "exploration_noise": settings.exploration_noise,
+        "alpha_init": settings.alpha_init,
+        "deterministic_draws": cfg.eval.draws,
+    }
 
 
 def make_aca(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
@@ -117,12 +101,23 @@ def make_aca(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
     The four steps are functions of a batch alone, so that each can be captured as a CUDA graph;
     what changes from update to update, which of them to take and the learning rate, stays outside.
     """
-    settings, optim = cfg.aca, cfg.optim
-    builder = aca_policy(cfg, env)
-    loss = make_aca_loss(cfg, builder.build(device, compile_step=cfg.compile))
-    target_update = SoftUpdate(loss, tau=optim.tau)
-    optimizer = make_adam(loss.qvalue_network.parameters(), optim.lr, cfg.cudagraphs)
-    alpha_optimizer = make_adam([loss.log_alpha], optim.alpha_lr, cfg.cudagraphs)
+    settings, optim, actor = cfg.aca, cfg.optim, actor_settings(cfg)
+    aca = torchrl_aca.make_aca(
+        env,
+        **actor,
+        compile_step=cfg.compile,
+        num_target_candidates=settings.num_target_candidates,
+        noise_level_target=settings.noise_level_target,
+        target_entropy_scale=settings.target_entropy_scale,
+        reward_scale=settings.reward_scale,
+        gamma=optim.gamma,
+        tau=optim.tau,
+        lr=optim.lr,
+        alpha_lr=optim.alpha_lr,
+        make_optimizer=partial(make_adam, cudagraphs=cfg.cudagraphs),
+        device=device,
+    )
+    loss, optimizer, alpha_optimizer = aca.loss, aca.optimizer, aca.alpha_optimizer
     # The decay counts steps of the optimiser, of which an update takes one or two.
     scheduler = linear_decay(optimizer, optim, optim.lr, optim.lr_end)
     progress = Counters()
@@ -146,7 +141,7 @@ def make_aca(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
 
     @partial(capture, enabled=cfg.cudagraphs)
     def target_step(batch: TensorDictBase) -> None:
-        target_update.step()
+        aca.target_update.step()
 
     def update(batch: TensorDictBase) -> TensorDictBase:
         metrics = td_step(batch)
@@ -161,7 +156,7 @@ def make_aca(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
         return metrics
 
     return Agent(
-        loss.actor_network,
+        aca.actor,
         update,
         state={
             "loss": loss,
@@ -170,5 +165,5 @@ def make_aca(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
             "scheduler": scheduler,
             "progress": progress,
         },
-        policy_builder=builder,
+        policy_builder=PolicyBuilder.of(env, make_aca_actor, **actor),
     )
