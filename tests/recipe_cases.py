@@ -48,6 +48,7 @@ TINY_SIZES = {
         "dacer.alpha_interval=20",
     ],
     "dipo": ["dipo.num_cells=[16,16]", "dipo.num_steps=4", "dipo.num_gradient_steps=5"],
+    "nclql": ["nclql.num_cells=[16,16]", "nclql.num_steps=3"],
     "qsm": [
         "qsm.num_cells=[16,16]",
         "qsm.num_steps=3",

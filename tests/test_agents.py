@@ -28,6 +28,7 @@ CPU = torch.device("cpu")
 EVERY = sorted(AGENTS)
 VARIANTS = [
     *((algo, []) for algo in EVERY),
+    ("aca", ["aca.guidance_weight=auto", "aca.target_value=soft"]),
     ("dacer", ["variant=dacer_sdac_repo"]),
     ("dipo", ["variant=dipo_sdac_repo"]),
     ("rlpd", ["variant=wsrl"]),
@@ -38,6 +39,7 @@ HUMANOID_PARAMETERS = {
     "aca": 475_746,
     "dacer": 707_909,
     "dipo": 710_419,
+    "nclql": 475_746,  # not in the table, but the network of ACA
     "qsm": 702_227,
     "qvpo": 707_395,
     "sac": 702_244,
@@ -68,6 +70,7 @@ BANDIT = {
         "dipo.num_steps=20",
         "dipo.num_gradient_steps=60",
     ],
+    "nclql": ["optim.lr=1e-2", "nclql.num_cells=[64,64]", "nclql.num_steps=9"],
     "qsm": [
         "optim.lr=1e-2",
         "optim.actor_lr=1e-2",

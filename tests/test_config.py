@@ -19,6 +19,11 @@ REFUSED = [
     ("aca.guidance_weight=inf", "aca.guidance_weight=inf: expected a finite number"),
     ("aca.guidance_weight=true", "aca.guidance_weight=True: expected a valid number"),
     ("aca.guidance_weight=-1", "expected greater than or equal to 0"),
+    ("aca.guidance_weight_init=0", "aca.guidance_weight_init=0: expected greater than 0"),
+    ("aca.guidance_weight_init=auto", "aca.guidance_weight_init='auto': expected a valid number"),
+    ("aca.guidance_weight_lr=0", "aca.guidance_weight_lr=0: expected greater than 0"),
+    ("aca.target_value=mean", "aca.target_value='mean': expected 'best' or 'soft'"),
+    ("aca.temperature=0", "aca.temperature=0: expected greater than 0"),
     ("aca.num_cells=5", "aca.num_cells=5: expected a valid list"),
     ("aca.num_cells=null", "aca.num_cells=None: expected a valid list"),
     ("aca.num_cells=[]", "aca.num_cells=.*at least 1 item"),
@@ -99,6 +104,11 @@ def test_a_mistake_is_told_with_key_expected_and_got(override, message):
 
 
 BESIDE = [
+    (
+        "aca.guidance_weight=auto",
+        "aca.num_target_candidates=1",
+        "num_target_candidates=1: expected at least 2 beside aca.guidance_weight=auto",
+    ),
     (
         "aca.inference_levels=[1,5,20]",
         "aca.num_inference_steps=8",

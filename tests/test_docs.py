@@ -267,6 +267,11 @@ def test_metrics_page_has_exactly_what_is_written(runs):
     actor = torchrl_aca.CriticGuidedDenoisingActor(critic, torchrl_aca.NoiseSchedule.cosine(20))
     loss = torchrl_aca.ACALoss(actor)
     written = {*loss.out_keys, loss.tensor_keys.priority}
+    tuned = torchrl_aca.ACALoss(actor, guidance_weight="auto")
+    following = TensorDict(observation=torch.zeros(2, 3), batch_size=[2])
+    data = TensorDict(action=torch.zeros(2, 2), next=following, batch_size=[2])
+    tuned.sample_next_action(data)
+    written |= set(tuned.step_guidance_weight(data).keys())
     for run_dir in runs.values():
         for table in ("metrics.csv", "eval.csv"):
             with open(run_dir / table, newline="") as file:

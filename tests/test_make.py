@@ -47,18 +47,26 @@ class TwoVectors(EnvBase):
 def test_it_is_what_the_parts_are_when_they_are_built_by_hand():
     env = GymEnv("Pendulum-v1")
     torch.manual_seed(0)
-    aca = make_aca(env, num_target_candidates=4, gamma=0.9, tau=0.1, lr=0.2, alpha_lr=0.3)
+    aca = make_aca(
+        env,
+        num_target_candidates=4,
+        loss={"reward_scale": 2.0},
+        gamma=0.9,
+        tau=0.1,
+        lr=0.2,
+        alpha_lr=0.3,
+    )
     torch.manual_seed(0)
     critic = NoiseLevelCritic(3, 1)
     actor = CriticGuidedDenoisingActor(
         critic, NoiseSchedule.cosine(20), spec=env.action_spec_unbatched
     )
-    loss = ACALoss(actor, num_target_candidates=4)
+    loss = ACALoss(actor, num_target_candidates=4, reward_scale=2.0)
     loss.make_value_estimator(gamma=0.9)
     for name, value in loss.state_dict().items():
         assert torch.equal(aca.loss.state_dict()[name], value), name
     assert aca.actor.half_range == 2  # Pendulum's torque
-    assert aca.loss.num_target_candidates == 4
+    assert aca.loss.num_target_candidates == 4 and aca.loss.reward_scale == 2
     groups = aca.optimizer.param_groups[0], aca.alpha_optimizer.param_groups[0]
     assert [group["lr"] for group in groups] == [0.2, 0.3]
     assert groups[1]["params"] == [aca.loss.log_alpha]

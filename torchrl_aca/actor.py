@@ -21,7 +21,7 @@ from torchrl_aca.chain_policy import ChainPolicy
 from torchrl_aca.checks import check_above, check_at_least, check_choice, first_parameter
 from torchrl_aca.critic import NoiseLevelCriticBase
 from torchrl_aca.custom_critic import as_noise_level_critic
-from torchrl_aca.schedule import NoiseSchedule
+from torchrl_aca.schedule import NoiseSchedule, VarianceExplodingSchedule
 
 __all__ = ["CriticGuidedDenoisingActor"]
 
@@ -57,7 +57,8 @@ class CriticGuidedDenoisingActor(ChainPolicy):
         action_dim: size ``A`` of the action, needed only without ``spec`` for a critic without an
             ``action_dim`` of its own.
         guidance_weight: ``w``. It is part of the actor's state, so that collectors and checkpoints
-            carry it; ``actor.guidance_weight = 3`` sets it. Default: 50.
+            carry it; ``actor.guidance_weight = 3`` sets it, and a loss with
+            ``guidance_weight="auto"`` moves it from here. Default: 50.
         num_candidates: ``N``. Default: 32.
         num_inference_steps: number ``S`` of steps of the chain, from 2 to ``T``. Fewer than ``T``
             visit the low levels and skip high ones (:func:`~torchrl_aca.chain.inference_levels`).
@@ -97,11 +98,13 @@ class CriticGuidedDenoisingActor(ChainPolicy):
     """
 
     guidance_weight: Tensor
+    schedule: Any
+    chain_schedule: Any
 
     def __init__(
         self,
         critic: nn.Module,
-        schedule: NoiseSchedule,
+        schedule: NoiseSchedule | VarianceExplodingSchedule,
         *,
         spec: TensorSpec | None = None,
         action_dim: int | None = None,
@@ -213,6 +216,7 @@ class CriticGuidedDenoisingActor(ChainPolicy):
         """
         return self._from_noise(observation, noise, keep_path=True).reshape(noise.shape)
 
+    @torch.no_grad()
     def select(self, observation: Tensor | Sequence[Tensor], candidates: Tensor) -> Tensor:
         """The best candidate by the minimum over the critics at level 0.
 
@@ -225,7 +229,8 @@ class CriticGuidedDenoisingActor(ChainPolicy):
         """
         batch = candidates.shape[1:-1]
         rows = candidates.reshape(candidates.shape[0], -1, candidates.shape[-1])
-        return self._select(self.encode(observation, batch), rows).reshape(candidates.shape[1:])
+        values = self.values(self.encode(observation, batch), rows)
+        return F.select_best(rows, values).reshape(candidates.shape[1:])
 
     def _from_noise(
         self, observation: Tensor | Sequence[Tensor], noise: Tensor, keep_path: bool
@@ -234,8 +239,42 @@ class CriticGuidedDenoisingActor(ChainPolicy):
         rows = noise.reshape(*noise.shape[:2], batch.numel(), noise.shape[-1])
         return self._chains(self.encode(observation, batch), rows, keep_path)
 
-    def _chains(self, features: Any, noise: Tensor, keep_path: bool = False) -> Tensor:
+    @torch.no_grad()
+    def propose(
+        self, features: Any, noise: Tensor, guidance_weight: Tensor | None = None
+    ) -> Tensor:
+        """As :meth:`denoise`, for states that are encoded already.
+
+        Args:
+            features: what :meth:`encode` gave for ``B`` states.
+            noise: standard normal draws of shape ``(S + 1, N, B, A)``.
+            guidance_weight: ``w`` of this call. Default: the actor's.
+
+        Returns:
+            All candidates in critic units, shape ``(N, B, A)``.
+        """
+        return self._chains(features, noise, weight=guidance_weight)
+
+    @torch.no_grad()
+    def values(self, features: Any, candidates: Tensor) -> Tensor:
+        """The critics at level 0, shape ``(N, B, E)``.
+
+        Args:
+            features: as in :meth:`propose`.
+            candidates: actions in critic units, shape ``(N, B, A)``.
+        """
+        tiles = chain.tiles(candidates, self.tile_rows, dim=0)
+        return torch.cat([self._run(self._clean_values, features, tile) for tile in tiles])
+
+    def _chains(
+        self,
+        features: Any,
+        noise: Tensor,
+        keep_path: bool = False,
+        weight: Tensor | None = None,
+    ) -> Tensor:
         """Chains of ``noise``, ``(S + 1, N, rows, A)``, by the chosen sampler."""
+        weight = self.guidance_weight if weight is None else weight
         how: dict[str, Any] = {
             "keep_path": keep_path,
             "tile_rows": self.tile_rows,
@@ -243,9 +282,9 @@ class CriticGuidedDenoisingActor(ChainPolicy):
         }
         if self.sampler == "langevin":
             gradient = partial(self._clean_gradient, features)
-            weight, step_size = self.guidance_weight, self.langevin_step_size
+            step_size = self.langevin_step_size
             return chain.langevin(gradient, noise, step_size, guidance_weight=weight, **how)
-        predict_noise = partial(self._predict_noise, features)
+        predict_noise = partial(self._predict_noise, features, weight)
         return chain.denoise(
             predict_noise,
             self.chain_schedule,
@@ -255,12 +294,14 @@ class CriticGuidedDenoisingActor(ChainPolicy):
             **how,
         )
 
-    def _predict_noise(self, features: Any, action: Tensor, level: Tensor) -> Tensor:
+    def _predict_noise(
+        self, features: Any, weight: Tensor, action: Tensor, level: Tensor
+    ) -> Tensor:
         """Guided as at this level of the whole chain, however long the stride from here."""
         variance = self.schedule.posterior_variance
         sigma = self.schedule.at(variance, level, action.dtype).sqrt()
         gradient = self._gradient(features, action, level)
-        return F.guided_noise(gradient, self.guidance_weight, sigma)
+        return F.guided_noise(gradient, weight, sigma)
 
     def _clean_gradient(self, features: Any, action: Tensor) -> Tensor:
         return self._gradient(features, action, _clean_level(action))
@@ -271,12 +312,6 @@ class CriticGuidedDenoisingActor(ChainPolicy):
 
     def _clean_values(self, features: Any, candidates: Tensor) -> Tensor:
         return self.critic.evaluate(features, candidates, _clean_level(candidates))
-
-    @torch.no_grad()
-    def _select(self, features: Any, candidates: Tensor) -> Tensor:
-        tiles = chain.tiles(candidates, self.tile_rows, dim=0)
-        values = [self._run(self._clean_values, features, tile) for tile in tiles]
-        return F.select_best(candidates, torch.cat(values))
 
     # --- acting -----------------------------------------------------------------------------------
 
@@ -303,8 +338,9 @@ class CriticGuidedDenoisingActor(ChainPolicy):
         batch = torch.Size(batch)
         features = self.encode(observation, batch)
         draws = self.draws(batch.numel(), num_candidates, deterministic)
-        action = self._select(features, self._chains(features, draws[:-1]))
-        action = self.explore(action, draws[-1, 0])
+        candidates = self.propose(features, draws[:-1])
+        best = F.select_best(candidates, self.values(features, candidates))
+        action = self.explore(best, draws[-1, 0])
         return self.to_env(action).reshape(*batch, self.action_dim)
 
     @dispatch(auto_batch_size=False)

@@ -139,10 +139,11 @@ def denoise(
 
 
 def langevin(
-    gradient: Callable[[Tensor], Tensor],
+    gradient: Callable[..., Tensor],
     noise: Tensor,
     step_size: float | Sequence[float] | Tensor,
     *,
+    levels: Tensor | None = None,
     guidance_weight: float | Tensor = 1.0,
     clip: bool | float = False,
     initial_scale: float = 1.0,
@@ -153,11 +154,13 @@ def langevin(
     """Langevin steps ``a + eps_k/2 w g(a) + sqrt(eps_k) z`` along a gradient.
 
     Args:
-        gradient: ``action -> g``.
+        gradient: ``action -> g``, or ``(action, level) -> g`` with ``levels``.
         noise: as in :func:`denoise`; every step adds its row.
         step_size: ``eps``, one number, or one of shape ``(S,)`` for each step, first to last.
 
     Keyword Args:
+        levels: the noise level of each step, integers of shape ``(S,)``, first to last; annealed
+            Langevin dynamics. Default: the gradient knows none.
         guidance_weight: ``w``. Default: 1.
         clip: clip the action after each step to [-1, 1], or to [-c, c] for a number ``c``.
             Default: False.
@@ -171,7 +174,11 @@ def langevin(
     """
     sizes = torch.as_tensor(step_size, dtype=torch.float64, device=noise.device)
     sizes = sizes.expand(len(noise) - 1)
-    steps = [partial(run, _langevin_step, gradient, guidance_weight, clip, eps) for eps in sizes]
+    known: list[tuple[Tensor, ...]] = [()] * len(sizes) if levels is None else list(zip(levels))
+    steps = [
+        partial(run, _langevin_step, gradient, guidance_weight, clip, eps, *level)
+        for eps, level in zip(sizes, known, strict=True)
+    ]
     return _walk(steps, initial_scale, noise, keep_path, tile_rows)
 
 
@@ -261,14 +268,15 @@ def _no_noise(action: Tensor, level: Tensor) -> Tensor:
 
 
 def _langevin_step(
-    gradient: Callable[[Tensor], Tensor],
+    gradient: Callable[..., Tensor],
     guidance_weight: float | Tensor,
     clip: bool | float,
     step_size: Tensor,
-    action: Tensor,
-    noise: Tensor,
+    *level_action_noise: Tensor,
 ) -> Tensor:
-    action = F.langevin_step(action, gradient(action), guidance_weight, step_size, noise)
+    *level, action, noise = level_action_noise
+    gradient_here = gradient(action, *level)
+    action = F.langevin_step(action, gradient_here, guidance_weight, step_size, noise)
     return _clipped(action, clip)
 
 

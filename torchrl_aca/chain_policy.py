@@ -65,7 +65,11 @@ class ChainPolicy(TensorDictModuleBase):
         self.in_keys, self.out_keys = list(in_keys), list(out_keys)
         self.log_alpha = nn.Parameter(like.new_tensor(math.log(alpha_init)))
         self._set_spec(like, spec, action_dim)
-        shape = (num_steps + 1, num_candidates, self.action_dim)
+        self._fix_noise(like, num_steps)
+
+    def _fix_noise(self, like: Tensor, num_steps: int) -> None:
+        """The draws of deterministic calls, for a chain of so many steps."""
+        shape = (num_steps + 1, self.num_candidates, self.action_dim)
         noise = torch.randn(shape, generator=torch.Generator().manual_seed(0))
         self.register_buffer("fixed_noise", noise.to(like), persistent=False)
 

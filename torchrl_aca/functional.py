@@ -19,7 +19,11 @@ __all__ = [
     "activate",
     "activation_and_slope",
     "add_noise",
+    "candidate_spread",
     "cosine_betas",
+    "entropy_std",
+    "guidance_gain",
+    "guidance_step",
     "guided_noise",
     "langevin_step",
     "linear_betas",
@@ -31,6 +35,7 @@ __all__ = [
     "predict_clean",
     "select_best",
     "sinusoidal_embedding",
+    "soft_value",
     "surrogate_entropy",
     "vp_betas",
 ]
@@ -225,6 +230,26 @@ def select_best(candidates: Tensor, values: Tensor) -> Tensor:
     return candidates.take_along_dim(best[None, ..., None], dim=0).squeeze(0)
 
 
+def soft_value(values: Tensor, temperature: float) -> Tensor:
+    """``tau log mean_n exp(V_n / tau)``: from the mean over the candidates to their best.
+
+    ``V_n`` is the smallest critic's value. The mean for ``tau -> inf``, the maximum for
+    ``tau -> 0`` (mellowmax, Asadi & Littman 2017); precise at both ends.
+
+    Args:
+        values: critic values of shape ``(N, *batch, E)``.
+        temperature: ``tau`` above 0, in units of the values.
+
+    Returns:
+        Tensor of shape ``(*batch,)``.
+    """
+    lowest = values.amin(-1)
+    highest = lowest.amax(0)
+    # expm1 and log1p, as for a large tau all exponentials round to 1 and the mean would be lost.
+    excess = ((lowest - highest) / temperature).expm1().mean(0)
+    return highest + temperature * excess.log1p()
+
+
 def surrogate_entropy(log_alpha: Tensor, action_dim: int, noise_scale: float = 0.1) -> Tensor:
     """Entropy of the exploration noise ``N(0, (noise_scale * alpha)^2 I)``, in nats.
 
@@ -232,3 +257,62 @@ def surrogate_entropy(log_alpha: Tensor, action_dim: int, noise_scale: float = 0
     open-loop schedule towards ``noise_scale * alpha = exp(H_target / A) / sqrt(2 pi e)``.
     """
     return action_dim * (0.5 * math.log(2 * math.pi * math.e) + math.log(noise_scale) + log_alpha)
+
+
+# --- a guidance weight that tunes itself ----------------------------------------------------------
+
+
+def entropy_std(entropy: Tensor, action_dim: int) -> Tensor:
+    """Standard deviation of the Gaussian ``N(0, std^2 I)`` of an entropy in nats.
+
+    ``exp(H / A) / sqrt(2 pi e)``, where :func:`surrogate_entropy` leads the exploration noise too.
+    """
+    return (entropy / action_dim).exp() / math.sqrt(2 * math.pi * math.e)
+
+
+def candidate_spread(candidates: Tensor) -> Tensor:
+    """Standard deviation of a state's candidates, by the mean of the variances over dimensions.
+
+    Args:
+        candidates: actions of shape ``(N, *batch, A)``, two or more for each state.
+
+    Returns:
+        Tensor of shape ``(*batch,)``. Dimensions in which all candidates lie on the border of the
+        box count with zero.
+    """
+    return candidates.var(0).mean(-1).sqrt()
+
+
+def guidance_gain(values: Tensor, log_ratio: float) -> Tensor:
+    """How fast the candidates' value rises with ``log w``, in standard deviations of that value.
+
+    ``g_s = (mean of V over the first half - over the second) / log_ratio / sigma``, where ``V`` is
+    the smallest critic's value and ``sigma^2`` its variance among a state's candidates, averaged
+    over the states. The factor of the rewards cancels.
+
+    Args:
+        values: critic values at level 0 of shape ``(N, *batch, E)``; the second half of the ``N``
+            comes from chains with a guidance weight ``exp(log_ratio)`` times smaller.
+        log_ratio: see ``values``.
+
+    Returns:
+        Tensor of shape ``(*batch,)``, whose mean is the derivative.
+    """
+    lowest = values.amin(-1)
+    more, less = lowest.tensor_split(2)
+    scale = lowest.var(0).mean().sqrt()
+    return (more.mean(0) - less.mean(0)) / (log_ratio * scale + torch.finfo(scale.dtype).tiny)
+
+
+def guidance_step(spread: Tensor, target: Tensor, gain: Tensor) -> Tensor:
+    """Direction of ``log w``: ``min(log(spread / target), gain)``, cut to [-1, 1].
+
+    The first is SAC's rule for its temperature, with the spread in the place of the entropy. The
+    second stops it where a larger weight no longer raises the value.
+
+    Args:
+        spread: of the candidates, shape ``()``.
+        target: of the spread, shape ``()``.
+        gain: mean of :func:`guidance_gain`, shape ``()``.
+    """
+    return torch.minimum((spread / target).log(), gain).clamp(-1, 1)

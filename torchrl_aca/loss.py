@@ -16,14 +16,15 @@ from torchrl.objectives.utils import distance_loss
 
 from torchrl_aca import functional as F
 from torchrl_aca.actor import CriticGuidedDenoisingActor
-from torchrl_aca.checks import check_at_least, check_choice
+from torchrl_aca.checks import check_above, check_at_least, check_choice
 from torchrl_aca.critic import NoiseLevelCriticBase
-from torchrl_aca.td_loss import OpenLoopAlpha, TDLoss, next_key
+from torchrl_aca.td_loss import TDLoss, next_key
+from torchrl_aca.tuning import AutoGuidance, OpenLoopAlpha
 
 __all__ = ["ACALoss"]
 
 
-class ACALoss(OpenLoopAlpha, TDLoss):
+class ACALoss(OpenLoopAlpha, AutoGuidance, TDLoss):
     """Loss module of *Actor-Critic without Actor* (arXiv 2509.21022).
 
     Three losses, each to be had alone as a TensorDict of its ``loss_*`` entry and metrics:
@@ -51,8 +52,20 @@ class ACALoss(OpenLoopAlpha, TDLoss):
         qvalue_network: may be passed for symmetry with TorchRL's losses; must be the actor's
             critic.
         num_target_candidates: ``N`` of ``a'_0``. Default: the actor's ``num_candidates``.
-        noise_level_target: ``"mean"`` over the critics (official code) or each critic's own value,
-            ``"self"`` (paper). Default: ``"mean"``.
+        target_value: value of the next state: of the ``"best"`` candidate (paper), or the
+            ``"soft"`` value of all of them, each with exploration noise of its own:
+            ``tau log mean_n exp(min_i Q_bar_i(s', a'_n, 0) / tau)``. Default: ``"best"``.
+        temperature: ``tau`` of the soft value, in scaled reward. Default: 0.1.
+        guidance_weight: ``"fixed"``, or ``"auto"`` for :meth:`step_guidance_weight`, which moves
+            the actor's ``w`` from where it is; it needs two target candidates or more. Default:
+            ``"fixed"``, the paper.
+        guidance_weight_lr: rate of the steps on ``log w``. Default: 0.01.
+        target_spread: standard deviation below which those steps do not press the candidates, in
+            critic units, or ``"auto"`` for that of a Gaussian of the target entropy,
+            ``exp(H_target / A) / sqrt(2 pi e)``. Default: ``"auto"``.
+        noise_level_target: ``"mean"`` over the critics (official code), each critic's own value,
+            ``"self"`` (paper), or ``"target"``, the mean over the target critics (NC-LQL). Default:
+            ``"mean"``.
         target_entropy: ``H_target`` in nats, or ``"auto"`` for ``-target_entropy_scale * A``.
         target_entropy_scale: default 0.9.
         entropy_noise_scale: the noise scale inside ``H``. The official code has 0.1 here whatever
@@ -69,7 +82,8 @@ class ACALoss(OpenLoopAlpha, TDLoss):
             always. Default: True.
 
     Random draws are taken from the input where it has them: ``noise_level`` (from ``1..T``),
-    ``noise`` (standard normal, shape of the action) and ``next_action`` (``a'_0`` in env units).
+    ``noise`` (standard normal, shape of the action) and ``next_action`` (``a'_0`` in env units; all
+    of them, of shape ``(*batch, N, A)``, with ``target_value="soft"``).
     Where replay data hold entries of these names that mean something else, rename what the loss
     looks for with :meth:`set_keys`, or pass ``use_given_draws=False``.
 
@@ -95,6 +109,8 @@ class ACALoss(OpenLoopAlpha, TDLoss):
             noise_level: optional given noise levels.
             noise: optional given noise of the noise-level loss.
             next_action: optional given next action, in env units.
+            candidate_spread: where the spread of the target's candidates is written.
+            guidance_gain: where their gain by more guidance is written.
             priority: where the TD error for prioritised replay is written.
             reward: the reward, below ``"next"``.
             done: the done flag, below ``"next"``.
@@ -108,6 +124,8 @@ class ACALoss(OpenLoopAlpha, TDLoss):
         noise_level: NestedKey = "noise_level"
         noise: NestedKey = "noise"
         next_action: NestedKey = "next_action"
+        candidate_spread: NestedKey = "candidate_spread"
+        guidance_gain: NestedKey = "guidance_gain"
         priority: NestedKey = "td_error"
         reward: NestedKey = "reward"
         done: NestedKey = "done"
@@ -140,7 +158,12 @@ class ACALoss(OpenLoopAlpha, TDLoss):
         *,
         qvalue_network: nn.Module | None = None,
         num_target_candidates: int | None = None,
-        noise_level_target: Literal["mean", "self"] = "mean",
+        target_value: Literal["best", "soft"] = "best",
+        temperature: float = 0.1,
+        guidance_weight: Literal["fixed", "auto"] = "fixed",
+        guidance_weight_lr: float = 0.01,
+        target_spread: float | Literal["auto"] = "auto",
+        noise_level_target: Literal["mean", "self", "target"] = "mean",
         target_entropy: float | Literal["auto"] = "auto",
         target_entropy_scale: float = 0.9,
         entropy_noise_scale: float = 0.1,
@@ -158,16 +181,18 @@ class ACALoss(OpenLoopAlpha, TDLoss):
                 "qvalue_network must be actor_network.critic: in ACA the critic is the actor. "
                 "Leave it out, or build the actor with this network."
             )
-        check_choice(("mean", "self"), noise_level_target=noise_level_target)
+        check_choice(("mean", "self", "target"), noise_level_target=noise_level_target)
         if num_target_candidates is None:
             num_target_candidates = actor_network.num_candidates
         check_at_least(1, num_target_candidates=num_target_candidates)
+        check_choice(("best", "soft"), target_value=target_value)
+        check_above(0, temperature=temperature)
         # The actor is no submodule: its parameters are listed below, and only once.
         self.__dict__["actor_network"] = actor_network
         self.convert_to_functional(critic, "qvalue_network", create_target_params=delay_qvalue)
-        self.register_buffer("guidance_weight", actor_network.guidance_weight)
         self.delay_qvalue = delay_qvalue
         self.num_target_candidates = num_target_candidates
+        self.target_value, self.temperature = target_value, temperature
         self.noise_level_target = noise_level_target
         self.reward_scale = reward_scale
         self.loss_function = loss_function
@@ -175,6 +200,7 @@ class ACALoss(OpenLoopAlpha, TDLoss):
         self.use_prioritized_weights = use_prioritized_weights
         self.use_given_draws = use_given_draws
         self._init_alpha(target_entropy, target_entropy_scale, entropy_noise_scale)
+        self._init_guidance(guidance_weight, guidance_weight_lr, target_spread)
         self.set_keys(
             action=actor_network.out_keys[0],
             state_action_value=critic.value_key,
@@ -210,8 +236,7 @@ class ACALoss(OpenLoopAlpha, TDLoss):
         noisy_action = schedule.add_noise(action, noise, level)
         with self._critics(self.qvalue_network_params):
             features = self.actor_network.encode(observation, action.shape[:-1])
-            with torch.no_grad():
-                clean_value = self._values(features, action, self._clean_level(action))
+            clean_value = self._clean_value(features, observation, action)
             value = self._values(features, noisy_action, level)
         target = F.noise_level_target(clean_value, self.noise_level_target)
         error = distance_loss(value, target, self.loss_function).sum(-1)
@@ -239,14 +264,29 @@ class ACALoss(OpenLoopAlpha, TDLoss):
     def sample_next_action(self, tensordict: TensorDictBase) -> Tensor:
         """Draws ``a'_0`` of the target, in env units, shape ``(*batch, A)``.
 
+        With ``target_value="soft"`` it is all candidates, of shape ``(*batch, N, A)``.
+
         :meth:`qvalue_loss` does so by itself where the input has no ``next_action``. Drawn
-        beforehand, it lets the rest of the loss be compiled without the chain.
+        beforehand, it lets the rest of the loss be compiled without the chain. With
+        ``guidance_weight="auto"`` it writes the spread of the candidates and their gain by more
+        guidance to ``tensordict``, both of shape ``(*batch,)``.
         """
-        observation = [tensordict[next_key(key)] for key in self.actor_network.in_keys]
+        actor = self.actor_network
+        observation = [tensordict[next_key(key)] for key in actor.in_keys]
         batch = tensordict[self.tensor_keys.action].shape[:-1]
-        return self.actor_network.sample(
-            observation, batch, num_candidates=self.num_target_candidates
-        )
+        features = actor.encode(observation, batch)
+        draws = actor.draws(batch.numel(), self.num_target_candidates)
+        candidates = self._candidates(features, draws[:-1])
+        soft = self.target_value == "soft"
+        if self.auto_guidance or not soft:
+            values = actor.values(features, candidates)
+        if self.auto_guidance:
+            self._note_guidance(tensordict, candidates, values)
+        if soft:
+            action = actor.explore(candidates, draws[-1]).movedim(0, 1)
+        else:
+            action = actor.explore(F.select_best(candidates, values), draws[-1, 0])
+        return actor.to_env(action).reshape(*batch, *action.shape[1:])
 
     @torch.no_grad()
     def _target_value(self, tensordict: TensorDictBase) -> Tensor:
@@ -257,11 +297,31 @@ class ACALoss(OpenLoopAlpha, TDLoss):
         if next_action is None:
             next_action = self.sample_next_action(tensordict)
         next_action = actor.from_env(next_action)
+        batch = tensordict[keys.action].shape[:-1]
         with self._critics(self._target_params()):
-            features = actor.encode(observation, next_action.shape[:-1])
-            next_values = self._values(features, next_action, self._clean_level(next_action))
-        next_value = next_values.amin(-1, keepdim=True)
+            features = actor.encode(observation, batch)
+            if self.target_value == "soft":
+                next_value = self._soft_value(features, next_action).reshape(*batch, 1)
+            else:
+                next_values = self._values(features, next_action, self._clean_level(next_action))
+                next_value = next_values.amin(-1, keepdim=True)
         return self._td_target(tensordict, next_value, self.reward_scale)
+
+    def _soft_value(self, features: Any, actions: Tensor) -> Tensor:
+        """Soft value ``(B,)`` of actions ``(*batch, N, A)``, in one pass over ``N B`` rows."""
+        candidates = actions.reshape(-1, *actions.shape[-2:]).movedim(1, 0)
+        level = torch.zeros((), dtype=torch.long, device=actions.device)
+        values = self.qvalue_network.evaluate(features, candidates, level)
+        return F.soft_value(values, self.temperature)
+
+    @torch.no_grad()
+    def _clean_value(self, features: Any, observation: list[Tensor], action: Tensor) -> Tensor:
+        """What the noisy levels learn, ``(*batch, E)``: by the online critics or their targets."""
+        if self.noise_level_target != "target":
+            return self._values(features, action, self._clean_level(action))
+        with self._critics(self._target_params()):
+            features = self.actor_network.encode(observation, action.shape[:-1])
+            return self._values(features, action, self._clean_level(action))
 
     def _state_and_action(self, tensordict: TensorDictBase) -> tuple[list[Tensor], Tensor]:
         """Observations as they are, and the action in critic units."""
@@ -282,7 +342,7 @@ class ACALoss(OpenLoopAlpha, TDLoss):
         """The actor holds the loss's parameters and buffers."""
         super()._tie()
         self._tie_alpha()
-        self.guidance_weight = self.actor_network.guidance_weight
+        self._tie_guidance()
 
     def _apply(self, fn: Callable) -> ACALoss:
         """Take the actor along."""

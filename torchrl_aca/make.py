@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -103,9 +103,7 @@ def make_aca(
     *,
     observation_keys: Sequence[NestedKey] = ("observation",),
     num_target_candidates: int | None = None,
-    noise_level_target: str = "mean",
-    target_entropy_scale: float = 0.9,
-    reward_scale: float = 0.2,
+    loss: Mapping[str, Any] | None = None,
     gamma: float = 0.99,
     tau: float = 0.005,
     lr: float = 1e-3,
@@ -121,10 +119,8 @@ def make_aca(
 
     Keyword Args:
         observation_keys: as in :func:`make_aca_actor`.
-        num_target_candidates: see :class:`ACALoss`, as the next three. Default: as for acting.
-        noise_level_target: default ``"mean"``.
-        target_entropy_scale: default 0.9.
-        reward_scale: default 0.2.
+        num_target_candidates: candidates in the target, ``N`` of ``a'_0``. Default: as for acting.
+        loss: other keywords of :class:`ACALoss`, such as ``{"reward_scale": 1.0}``.
         gamma: discount. Default: 0.99.
         tau: step of the target parameters. Default: 0.005.
         lr: learning rate of the critic. Default: 1e-3.
@@ -157,19 +153,13 @@ def make_aca(
         device=device,
         **actor,
     )
-    loss = ACALoss(
-        network,
-        num_target_candidates=num_target_candidates,
-        noise_level_target=noise_level_target,  # type: ignore[arg-type]
-        target_entropy_scale=target_entropy_scale,
-        reward_scale=reward_scale,
-    )
-    loss.make_value_estimator(gamma=gamma)
+    module = ACALoss(network, num_target_candidates=num_target_candidates, **(loss or {}))
+    module.make_value_estimator(gamma=gamma)
     return ACAParts(
-        loss,
-        SoftUpdate(loss, tau=tau),
-        make_optimizer(loss.qvalue_network.parameters(), lr=lr),
-        make_optimizer([loss.log_alpha], lr=alpha_lr),
+        module,
+        SoftUpdate(module, tau=tau),
+        make_optimizer(module.qvalue_network.parameters(), lr=lr),
+        make_optimizer([module.log_alpha], lr=alpha_lr),
     )
 
 

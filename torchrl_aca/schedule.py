@@ -3,16 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from torchrl_aca import functional as F
 
-__all__ = ["NoiseSchedule"]
+__all__ = ["NoiseSchedule", "VarianceExplodingSchedule"]
 
 
-class NoiseSchedule(nn.Module):
+class _Constants(nn.Module):
+    """Buffers that follow device moves and ignore casts: chains divide by numbers like 1e-3."""
+
+    def _apply(self, fn: Callable, recurse: bool = True) -> Any:
+        exact = dict(self.named_buffers())
+        super()._apply(fn, recurse)
+        for name, moved in list(self.named_buffers()):
+            self._buffers[name] = exact[name].to(moved.device)
+        return self
+
+
+class NoiseSchedule(_Constants):
     """Constants of a discrete diffusion process with ``T`` noise levels.
 
     Every attribute listed below is a buffer of shape ``(T,)``, float64 but for the levels; row
@@ -138,13 +150,57 @@ class NoiseSchedule(nn.Module):
         rows = constants.index_select(0, noise_level.reshape(-1) - 1)
         return rows.to(dtype).reshape(*noise_level.shape, 1)
 
-    def _apply(self, fn: Callable, recurse: bool = True) -> NoiseSchedule:
-        """Follow device moves, ignore casts: the chain divides by numbers as small as 1e-3."""
-        exact = dict(self.named_buffers())
-        super()._apply(fn, recurse)
-        for name, moved in list(self.named_buffers()):
-            self._buffers[name] = exact[name].to(moved.device)
+
+class VarianceExplodingSchedule(_Constants):
+    """Noise that is added to an action without shrinking it: ``a_k = a_0 + sigma_k eps``.
+
+    ``sigma_k = sigma_min (sigma_max / sigma_min)^(k / T)`` for the levels ``k = 0..T`` (Song &
+    Ermon 2019). Level 0 stands for the clean action: in annealed Langevin dynamics it is visited
+    last, with the noise of ``sigma_min``, but regression takes it as clean.
+
+    Args:
+        num_steps: number ``T`` of noisy levels.
+        sigma_min: standard deviation at level 0, in critic units.
+        sigma_max: standard deviation at level ``T``.
+
+    Attributes:
+        sigmas: float64 buffer of shape ``(T + 1,)``; row ``k`` belongs to level ``k``. It follows
+            device moves, keeps float64 when cast and is not part of the ``state_dict``.
+
+    Raises:
+        ValueError: if ``num_steps`` is no positive integer, or not ``0 < sigma_min < sigma_max``.
+    """
+
+    sigmas: Tensor
+
+    def __init__(self, num_steps: int, sigma_min: float = 1e-3, sigma_max: float = 0.1) -> None:
+        super().__init__()
+        if not 0 < sigma_min < sigma_max:
+            raise ValueError(
+                "VarianceExplodingSchedule expects 0 < sigma_min < sigma_max, "
+                f"got sigma_min={sigma_min} and sigma_max={sigma_max}."
+            )
+        grid = torch.arange(_positive(num_steps) + 1, dtype=torch.float64) / num_steps
+        self.register_buffer("sigmas", sigma_min * (sigma_max / sigma_min) ** grid, False)
+
+    @property
+    def num_steps(self) -> int:
+        """Number ``T`` of noisy levels."""
+        return len(self.sigmas) - 1
+
+    def restrict(self, levels: Sequence[int]) -> VarianceExplodingSchedule:
+        """The schedule itself, for all levels ``1..T``; a ValueError for fewer."""
+        if list(levels) != list(range(1, self.num_steps + 1)):
+            raise ValueError(
+                f"Annealed Langevin dynamics visits every level, got {list(levels)}. Leave "
+                "num_inference_steps and inference_levels out."
+            )
         return self
+
+    def add_noise(self, action: Tensor, noise: Tensor, noise_level: Tensor) -> Tensor:
+        """As :meth:`NoiseSchedule.add_noise`."""
+        sigma = self.sigmas[noise_level].to(action.dtype).unsqueeze(-1)
+        return action + sigma * noise
 
 
 def _positive(num_steps: int) -> int:

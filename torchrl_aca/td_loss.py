@@ -6,18 +6,15 @@ import copy
 from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, Literal, cast
+from typing import Any
 
-import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.utils import dispatch_value_estimator
 
-from torchrl_aca import functional as F
-
-__all__ = ["OpenLoopAlpha", "TDLoss", "next_key"]
+__all__ = ["TDLoss", "next_key"]
 
 
 class TDLoss(LossModule):
@@ -194,58 +191,6 @@ class TDLoss(LossModule):
     @out_keys.setter
     def out_keys(self, values: list[str]) -> None:
         self._out_keys = values
-
-
-class OpenLoopAlpha:
-    """Mixin of a loss whose actor explores with noise ``N(0, (noise_scale * alpha)^2 I)``.
-
-    ``alpha`` follows a schedule that depends on no data, towards the noise whose entropy is
-    ``H_target``: :meth:`alpha_loss`. The loss holds the very ``log_alpha`` of its actor.
-    """
-
-    actor_network: Any
-    log_alpha: Tensor
-    target_entropy: Tensor
-    entropy_noise_scale: float
-    reduction: str
-
-    def _init_alpha(
-        self, target_entropy: float | Literal["auto"], scale: float, noise_scale: float
-    ) -> None:
-        """Take over the actor's ``log_alpha``; ``"auto"`` is ``-scale * A``."""
-        self.log_alpha = self.actor_network.log_alpha
-        self.entropy_noise_scale = noise_scale
-        if target_entropy == "auto":
-            target_entropy = -scale * self.actor_network.action_dim
-        target = self.log_alpha.new_tensor(target_entropy)
-        cast(nn.Module, self).register_buffer("target_entropy", target)
-
-    def _tie_alpha(self) -> None:
-        """Give the actor the loss's ``log_alpha``."""
-        self.actor_network.log_alpha = self.log_alpha
-
-    def alpha_loss(self, tensordict: TensorDictBase | None = None) -> TensorDict:
-        """Open-loop schedule of the exploration noise; depends on no data.
-
-        Args:
-            tensordict: gives the shape of the loss where ``reduction="none"``; otherwise unused.
-        """
-        actor = self.actor_network
-        with torch.no_grad():
-            entropy = F.surrogate_entropy(
-                self.log_alpha, actor.action_dim, self.entropy_noise_scale
-            )
-        loss = self.log_alpha * (entropy - self.target_entropy)
-        alpha = self.log_alpha.detach().exp()
-        if self.reduction == "none" and tensordict is not None:
-            shape = tensordict.batch_size
-            return TensorDict({"loss_alpha": loss.expand(shape)}, batch_size=shape)
-        metrics = {
-            "alpha": alpha,
-            "entropy": entropy,
-            "exploration_std": alpha * actor.exploration_noise,
-        }
-        return TensorDict({"loss_alpha": loss, **metrics})
 
 
 def next_key(key: NestedKey) -> NestedKey:

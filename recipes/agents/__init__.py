@@ -25,6 +25,7 @@ from agents.dacer import DACEROptim, DACERSettings, make_dacer
 from agents.diffusion import DiffusionOptim
 from agents.dipo import DIPOOptim, DIPOSettings, make_dipo
 from agents.iql import IQLOptim, IQLSettings, make_iql
+from agents.nclql import NCLQLOptim, NCLQLSettings, make_nclql
 from agents.qsm import QSMSettings, make_qsm
 from agents.qvpo import QVPOSettings, make_qvpo
 from agents.rlpd import RLPDOptim, RLPDSettings, make_rlpd
@@ -59,6 +60,7 @@ AGENTS = {
     "dipo": Method(
         make_dipo, {"dipo": DIPOSettings, "variant": Variant, "optim": DIPOOptim}, mixes=False
     ),
+    "nclql": Method(make_nclql, {"nclql": NCLQLSettings, "optim": NCLQLOptim}),
     "qsm": Method(make_qsm, {"qsm": QSMSettings, "variant": Variant, "optim": DiffusionOptim}),
     "qvpo": Method(make_qvpo, {"qvpo": QVPOSettings, "variant": Variant, "optim": DiffusionOptim}),
     "rlpd": Method(make_rlpd, {"rlpd": RLPDSettings, "variant": Variant, "optim": RLPDOptim}),

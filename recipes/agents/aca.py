@@ -6,7 +6,7 @@ from functools import partial
 from typing import Annotated, Any, Literal
 
 import torch
-from pydantic import Field, model_validator
+from pydantic import Field, PlainSerializer, WrapValidator, model_validator
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
@@ -29,6 +29,14 @@ from torchrl_aca.training.policy import PolicyBuilder
 Candidates = Annotated[int, Field(ge=1, le=10**5)]
 
 
+# A number, or "auto"; a union of the two would tell a mistake twice.
+Weight = Annotated[
+    NonNegative,
+    WrapValidator(lambda value, number: value if value == "auto" else number(value)),
+    PlainSerializer(lambda value: value),
+]
+
+
 class ACASettings(Section):
     """The section `aca`."""
 
@@ -39,7 +47,11 @@ class ACASettings(Section):
     num_cells: Widths
     num_critics: Annotated[int, Field(ge=1, le=1000)]
     first_level: Annotated[int, Field(ge=0, le=1)]
-    guidance_weight: NonNegative
+    target_value: Literal["best", "soft"]
+    temperature: Positive
+    guidance_weight: Weight
+    guidance_weight_init: Positive
+    guidance_weight_lr: Positive
     num_candidates: Candidates
     num_target_candidates: Candidates
     exploration_noise: Annotated[float, Field(ge=0, le=1e3)]  # of actions in [-1, 1]
@@ -56,7 +68,14 @@ class ACASettings(Section):
             self.refuse("num_inference_steps", f"at most aca.num_steps ({self.num_steps})")
         if self.inference_levels is not None:
             self._check_levels(self.inference_levels)
+        if self.auto_guidance and self.num_target_candidates < 2:
+            self.refuse("num_target_candidates", "at least 2 beside aca.guidance_weight=auto")
         return self
+
+    @property
+    def auto_guidance(self) -> bool:
+        """Whether the guidance weight tunes itself."""
+        return self.guidance_weight == "auto"
 
     def _check_levels(self, levels: list[int]) -> None:
         """They replace `num_inference_steps`, which then holds its default or their number."""
@@ -78,14 +97,14 @@ class ACAOptim(DecayOptim):
 
 def actor_settings(cfg: Any) -> dict[str, Any]:
     """The keywords of `make_aca_actor`."""
-    settings, levels = cfg.aca, cfg.aca.inference_levels
+    settings, levels, auto = cfg.aca, cfg.aca.inference_levels, cfg.aca.auto_guidance
     return {
         "num_steps": settings.num_steps,
         "schedule": settings.schedule,
         "num_critics": settings.num_critics,
         "num_cells": settings.num_cells,
         "first_level": settings.first_level,
-        "guidance_weight": settings.guidance_weight,
+        "guidance_weight": settings.guidance_weight_init if auto else settings.guidance_weight,
         "num_candidates": settings.num_candidates,
         "num_inference_steps": settings.num_inference_steps if levels is None else None,
         "inference_levels": levels,
@@ -107,9 +126,15 @@ def make_aca(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
         **actor,
         compile_step=cfg.compile,
         num_target_candidates=settings.num_target_candidates,
-        noise_level_target=settings.noise_level_target,
-        target_entropy_scale=settings.target_entropy_scale,
-        reward_scale=settings.reward_scale,
+        loss={
+            "target_value": settings.target_value,
+            "temperature": settings.temperature,
+            "guidance_weight": "auto" if settings.auto_guidance else "fixed",
+            "guidance_weight_lr": settings.guidance_weight_lr,
+            "noise_level_target": settings.noise_level_target,
+            "target_entropy_scale": settings.target_entropy_scale,
+            "reward_scale": settings.reward_scale,
+        },
         gamma=optim.gamma,
         tau=optim.tau,
         lr=optim.lr,
@@ -129,7 +154,10 @@ def make_aca(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
     def td_step(batch: TensorDictBase) -> TensorDictBase:
         batch = batch.copy()
         batch[loss.tensor_keys.next_action] = loss.sample_next_action(batch)
-        return descend(qvalue_loss(batch), "loss_qvalue", optimizer)
+        metrics = descend(qvalue_loss(batch), "loss_qvalue", optimizer)
+        if settings.auto_guidance:
+            metrics.update(loss.step_guidance_weight(batch))
+        return metrics
 
     @partial(capture, enabled=cfg.cudagraphs)
     def noise_level_step(batch: TensorDictBase) -> TensorDictBase:

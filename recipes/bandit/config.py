@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from itertools import product
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from omegaconf import OmegaConf
 from pydantic import BeforeValidator, Field, model_validator
@@ -24,7 +24,7 @@ from torchrl_aca.training.config import (
 )
 
 Method = Literal[tuple(METHODS)]
-GUIDED = ("aca", "diffusion_q", "langevin_q")
+GUIDED = ("aca", "diffusion_q", "langevin_q", "nclql")
 RIVALS = ("sdac", "qsm", "dacer", "dipo")
 Processes = Annotated[int, Field(ge=1, le=4096)]
 
@@ -169,12 +169,33 @@ class BanditConfig(Section):
         return self
 
 
+class Beyond(Section):
+    """What `bandit_beyond.yaml` adds."""
+
+    reward_scale: Positive
+    interval: Count
+    guidance_weight_lr: Positive
+    num_states: Count
+    num_candidates: Annotated[int, Field(ge=2, le=10**4)]
+    num_proposals: Count
+    temperatures: Annotated[list[Positive], Field(min_length=1)]
+
+
+class BeyondConfig(BanditConfig):
+    """`bandit_beyond.yaml`."""
+
+    beyond: Beyond
+
+
+Config = TypeVar("Config", bound=BanditConfig)
+
+
 def combinations(options: Mapping[str, Sequence[Any]]) -> list[Row]:
     """Every way to choose one value for each key; the empty choice where there are no keys."""
     return [dict(zip(options, values, strict=True)) for values in product(*options.values())]
 
 
-def variants(cfg: BanditConfig) -> list[tuple[Row, BanditConfig]]:
+def variants(cfg: Config) -> list[tuple[Row, Config]]:
     """Every combination of `ablation.training`, with the configuration that has it.
 
     Raises:
@@ -185,5 +206,5 @@ def variants(cfg: BanditConfig) -> list[tuple[Row, BanditConfig]]:
         variant = OmegaConf.create(cfg.model_dump(exclude_unset=True))
         for key, value in changed.items():
             OmegaConf.update(variant, key, value)
-        made.append((changed, checked(BanditConfig, variant)))
+        made.append((changed, checked(type(cfg), variant)))
     return made

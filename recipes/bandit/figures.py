@@ -28,8 +28,14 @@ LABELS = {
     "qsm": "QSM",
     "dacer": "DACER",
     "dipo": "DIPO",
+    "nclql": "NC-LQL",
 }
-COLORS = {"aca": "#0072B2", "diffusion_q": "#D55E00", "langevin_q": "#009E73"}  # Okabe and Ito
+COLORS = {  # Okabe and Ito
+    "aca": "#0072B2",
+    "diffusion_q": "#D55E00",
+    "langevin_q": "#009E73",
+    "nclql": "#CC79A7",
+}
 HALF_WIDTH = 2.3  # of all maps: the same axes everywhere
 NUM_ARROWS = 200
 LEVELS = (9, 6, 3, 0)
@@ -106,9 +112,10 @@ def overview(actors: Actors, reported: Sequence[Mapping]) -> Figure:
     show_map(axes[0], reward(plane()), "reward")
     mark_high_modes(axes[0])
     axes[0].set_xlabel("circles: within 0.3 of a high mode", fontsize=9)
-    noise = torch.randn(next(iter(actors.values())).schedule.num_steps + 1, 1, NUM_ARROWS, 2)
+    longest = max(len(actor.fixed_noise) for actor in actors.values())
+    noise = torch.randn(longest, 1, NUM_ARROWS, 2)
     for ax, (method, actor) in zip(axes[1:], actors.items(), strict=True):
-        path = actor.trajectory(torch.zeros(NUM_ARROWS, 1), noise)[:, 0]
+        path = trajectory(actor, noise[: len(actor.fixed_noise)])
         arrows(ax, path, LABELS[method])
         runs = [row for row in reported if row["method"] == method]
         mean, std, share = (
@@ -183,9 +190,14 @@ def grid_trajectory(actor: Actor, num: int = 17) -> Tensor:
     """Every step of chains that start on a grid, (T+1, num^2, 2)."""
     line = torch.linspace(-2, 2, num)
     start = torch.cartesian_prod(line, line)
-    noise = torch.randn(actor.schedule.num_steps + 1, 1, len(start), 2)
+    noise = torch.randn(len(actor.fixed_noise), 1, len(start), 2)
     noise[0] = start
-    return actor.trajectory(torch.zeros(len(start), 1), noise)[:, 0]
+    return trajectory(actor, noise)
+
+
+def trajectory(actor: Actor, noise: Tensor) -> Tensor:
+    """Every step of one chain for each row, (S+1, rows, 2), in the modes' units."""
+    return actor.to_env(actor.trajectory(torch.zeros(noise.shape[2], 1), noise)[:, 0])
 
 
 def all_steps(title: str, path: Tensor) -> Figure:
@@ -212,12 +224,12 @@ def animate(paths: Mapping[str, Tensor], file: Path) -> None:
         dots.append(
             ax.scatter(*path[0].T, s=7, color="#FFE119", edgecolors="black", linewidths=0.3)
         )
-    last = len(next(iter(paths.values()))) - 1
+    last = max(map(len, paths.values())) - 1
 
     def frame(step: int) -> None:
         step = min(step, last)
         for dot, path in zip(dots, paths.values(), strict=True):
-            dot.set_offsets(path[step])
+            dot.set_offsets(path[min(step, len(path) - 1)])
         axes[0].set_xlabel(f"$a_{{{last - step}}}$")
 
     FuncAnimation(figure, frame, frames=last + 5).save(file, PillowWriter(fps=3), dpi=80)

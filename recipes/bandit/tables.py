@@ -19,6 +19,7 @@ METHODS = {
     "qsm": "QSM",
     "dacer": "DACER",
     "dipo": "DIPO",
+    "nclql": "NC-LQL",
 }
 PAPER = {
     "aca": (0.240, 0.256, 0.243, 0.254, 0.993),
@@ -34,7 +35,7 @@ Row = dict[str, Any]
 
 
 def summary(rows: Sequence[Row]) -> list[Row]:
-    """Means over the seeds, one row for each method, each beside the paper's.
+    """Means over the seeds, one row for each method, each beside the paper's if it has one.
 
     `w` is what the reward has chosen: the guidance weight, or the one setting of a rival.
     """
@@ -51,6 +52,8 @@ def summary(rows: Sequence[Row]) -> list[Row]:
             | {key: f"{value:.3f}" for key, value in mean.items()}
             | {"lowest_sum": f"{min(sums):.3f}", "highest_sum": f"{max(sums):.3f}", "w": weights}
         )
+        if method not in PAPER:
+            continue
         paper = dict(zip((*HIGH_MODES, "sum"), PAPER[method], strict=True))
         table.append(
             {"method": label, "source": "paper", **{k: f"{v:.3f}" for k, v in paper.items()}}

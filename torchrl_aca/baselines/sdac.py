@@ -15,7 +15,7 @@ from torchrl_aca import functional as F
 from torchrl_aca.baselines.diffusion_loss import DiffusionPolicyLoss
 from torchrl_aca.baselines.diffusion_policy import DiffusionPolicy
 from torchrl_aca.checks import check_above, check_at_least
-from torchrl_aca.td_loss import OpenLoopAlpha
+from torchrl_aca.tuning import OpenLoopAlpha
 
 __all__ = ["SDACLoss", "reverse_sampling_target"]
 
