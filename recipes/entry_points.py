@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import runpy
+import os
 import sys
 from pathlib import Path
 
@@ -34,7 +34,5 @@ def bandit() -> None:
 
 
 def _run(script: str) -> None:
-    path = str(FOLDER / script)
-    sys.path.insert(0, str(FOLDER))  # where Python looks when the script itself is run
-    sys.argv[0] = path
-    runpy.run_path(path, run_name="__main__")
+    """Goes on as the script: the same process, with its signals and its exit status."""
+    os.execv(sys.executable, [sys.executable, str(FOLDER / script), *sys.argv[1:]])

@@ -40,12 +40,11 @@ def test_each_command_runs_a_script_of_the_recipes(command, monkeypatch):
     module, _, function = PYPROJECT["project"]["scripts"][command].partition(":")
     entry_points = import_module(module.rpartition(".")[2])
     ran = []
-    monkeypatch.setattr(entry_points.runpy, "run_path", lambda path, run_name: ran.append(path))
-    monkeypatch.setattr(sys, "argv", [command])
-    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(entry_points.os, "execv", lambda program, arguments: ran.extend(arguments))
+    monkeypatch.setattr(sys, "argv", [command, "seed=1"])
     getattr(entry_points, function)()
-    assert Path(ran[0]).parent == RECIPES and Path(ran[0]).is_file()
-    assert sys.argv == ran and sys.path[0] == str(RECIPES)
+    assert ran[0] == sys.executable and ran[2:] == ["seed=1"]
+    assert Path(ran[1]).parent == RECIPES and Path(ran[1]).is_file()
 
 
 def test_an_installed_command_finds_its_configuration(tmp_path):
