@@ -21,37 +21,39 @@ import torch
 from torch import Tensor
 
 import renderer  # noqa: F401
-from agents import policy_of
 from fidelity.figure import draw, print_table
 from fidelity.measures import energy_distance_test, spread
 from fidelity.spacings import PACKAGE, SPACINGS, levels_of
 from torchrl_aca import CriticGuidedDenoisingActor
 from torchrl_aca.errors import RunError
 from torchrl_aca.training.checkpoint import list_checkpoints, read_checkpoint, updates_of
+from torchrl_aca.training.policy import build_policy, read_policy
 
 CANDIDATES, TEST_SAMPLES, PERMUTATIONS = 128, 2000, 199  # of a state
 
 
 def measure_checkpoint(
-    checkpoint: dict[str, Any], args: argparse.Namespace
+    policy: dict[str, Any], checkpoint: dict[str, Any], args: argparse.Namespace
 ) -> Iterator[dict[str, Any]]:
     """Yields a row for each chain; the first is the whole chain against itself, on other draws."""
-    actor, cfg = policy_of(checkpoint)
+    actor, config = build_policy(policy), policy["config"]
     if not isinstance(actor, CriticGuidedDenoisingActor):
-        raise RunError(f"algo={cfg.algo.name} has no chain to shorten. Give runs of algo=aca.")
+        name = config["algo"]["name"]
+        raise RunError(f"algo={name} has no chain to shorten. Give runs of algo=aca.")
     rows = checkpoint["parts"]["buffer"]["rows"]["observation"]
     states = rows[-args.states :]
     tested = states[:: max(len(states) // args.tested_states, 1)][: args.tested_states]
+    num_steps = actor.schedule.num_steps
     about = {
-        "task": cfg.env.name,
-        "schedule": cfg.aca.schedule,
-        "num_steps": cfg.aca.num_steps,
+        "task": config["env"]["name"],
+        "schedule": config["aca"]["schedule"],
+        "num_steps": num_steps,
         "normalized": not args.raw_gradient,
     }
-    whole = _Chain(actor, list(range(1, cfg.aca.num_steps + 1)), args)
+    whole = _Chain(actor, list(range(1, num_steps + 1)), args)
     reference = whole.sample(states, CANDIDATES), whole.sample(tested, TEST_SAMPLES)
-    chains = [("all", cfg.aca.num_steps)]
-    shorter = [steps for steps in args.steps if steps < cfg.aca.num_steps]
+    chains = [("all", num_steps)]
+    shorter = [steps for steps in args.steps if steps < num_steps]
     chains += [(spacing, steps) for spacing in (PACKAGE, *SPACINGS) for steps in shorter]
     for spacing, steps in chains:
         chain = whole
@@ -125,7 +127,8 @@ def measure_runs(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
         kept = [updates_of(path) for path in list_checkpoints(run_dir / "checkpoints")]
         for updates in args.updates or kept[-1:] or [None]:
             checkpoint = read_checkpoint(run_dir, updates)
-            for row in measure_checkpoint(checkpoint, args):
+            policy = read_policy(run_dir, updates)
+            for row in measure_checkpoint(policy, checkpoint, args):
                 print(f"{run_dir.name} {updates}: {row['spacing']} {row['levels']}", flush=True)
                 yield {"run": run_dir.name, "updates": updates, **row}
 

@@ -17,6 +17,10 @@ def train_offline_to_online() -> None:
     _run("o2o_halfcheetah.py")
 
 
+def evaluate() -> None:
+    _run("evaluate.py")
+
+
 def make_dataset() -> None:
     _run("make_dataset.py")
 

@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from agents import AGENTS, configured, load_policy, make_agent
+from agents import AGENTS, configured, make_agent
 from online_mujoco import train
 from recipe_cases import (
     CONFIGS,
@@ -21,8 +21,6 @@ from recipe_cases import (
     rows_of,
     without_time,
 )
-from torchrl_aca.errors import RunError
-from torchrl_aca.training.checkpoint import list_checkpoints, updates_of
 from torchrl_aca.training.envs import make_vector_env
 from torchrl_aca.training.resume import resumed_config
 
@@ -154,24 +152,6 @@ def test_stop_and_resume_equals_never_stopping(unbroken, tmp_path):
     # The shorter run also evaluated at its own end.
     evaluations = [row for row in rows_of(here / "eval.csv") if row["updates"] != "34"]
     assert evaluations == rows_of(run_dir / "eval.csv")
-
-
-def test_the_policy_of_a_run_can_be_taken_out_of_it(unbroken):
-    run_dir, settings = unbroken
-    policy, cfg = load_policy(run_dir)
-    assert cfg.env.name == "Hopper-v4" and cfg.algo.name == settings[0].partition("=")[2]
-    data = TensorDict(observation=torch.randn(5, 11), batch_size=[5])
-    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
-        action = policy(data.clone())["action"]
-    assert action.shape == (5, 3) and action.isfinite().all()
-    first = updates_of(list_checkpoints(run_dir / "checkpoints")[0])
-    earlier, _ = load_policy(run_dir, updates=first)
-    pairs = zip(earlier.parameters(), policy.parameters(), strict=True)
-    assert any(not torch.equal(*pair) for pair in pairs)
-    with pytest.raises(RunError, match="expected a checkpoint of 7 updates, found those of"):
-        load_policy(run_dir, updates=7)
-    with pytest.raises(RunError, match="expected a run directory with checkpoints"):
-        load_policy(run_dir.parent)
 
 
 @pytest.mark.parametrize("algo", EVERY)

@@ -31,7 +31,7 @@ DOCS = ROOT / "docs"
 CONFIGS = ROOT / "recipes" / "configs"
 PAGES = [ROOT / "README.md", *(p for p in sorted(DOCS.rglob("*.md")) if "_build" not in p.parts)]
 BLOCK = re.compile(r"(?:<!-- needs: (\S+) -->\n)?^```python(.*)\n((?:.*\n)*?)^```$", re.MULTILINE)
-RECIPES = "online_mujoco|o2o_halfcheetah|make_dataset|import_dataset"
+RECIPES = "online_mujoco|o2o_halfcheetah|evaluate|make_dataset|import_dataset"
 COMMAND = re.compile(rf"python recipes/({RECIPES})\.py((?:\\\n|[^\n`#])*)")
 
 
@@ -52,8 +52,10 @@ def blocks(page: Path):
 
 
 @pytest.mark.parametrize("page", [p for p in PAGES if any(blocks(p))], ids=name_of)
-def test_blocks_run_in_order(page, tmp_path, monkeypatch):
+def test_blocks_run_in_order(page, tmp_path, monkeypatch, request):
     monkeypatch.chdir(tmp_path)
+    if 'load_policy("runs/' in page.read_text():
+        (tmp_path / "runs").symlink_to(request.getfixturevalue("runs")["aca"].parent)
     namespace = {"__name__": "__docs__"}
     left_out = []
     for line, needs, code in blocks(page):
@@ -203,6 +205,13 @@ def test_offline_config_page_has_every_key_with_its_default():
     assert documented("`import_dataset.py`") == {**importer, **unset}
 
 
+def test_the_page_of_evaluate_has_every_key_with_its_default():
+    keys = {key: plain(value) for key, value in flat(composed("run=x", name="evaluate")).items()}
+    rows = table_rows("howto/use_policy.md")
+    told = {key.strip("`"): yaml.safe_load(default.strip("`")) for key, default, *_ in rows}
+    assert told == {**keys, "run": "???"}
+
+
 @pytest.mark.parametrize(
     ("section", "algo", "variant"),
     [
@@ -273,7 +282,7 @@ def test_metrics_page_has_exactly_what_is_written(runs):
 def test_a_run_leaves_the_files_and_the_state_that_the_pages_name(runs):
     named = {row[0].strip("`") for row in table_rows("quickstart.md")}
     assert {path.name for path in runs["aca"].iterdir()} == {name.rstrip("/") for name in named}
-    (checkpoint,) = (runs["aca"] / "checkpoints").iterdir()
+    (checkpoint,) = (runs["aca"] / "checkpoints").glob("checkpoint_*.pt")
     assert "agent.loss" in torch.load(checkpoint, weights_only=True)["parts"]
 
 

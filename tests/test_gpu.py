@@ -5,10 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 
-from agents import configured, load_policy, make_agent
+from agents import configured, make_agent
 from loss_cases import make_actor, make_data, make_loss
 from online_mujoco import train
 from recipe_cases import TINY, batch_of, composed, rows_of
+from torchrl_aca.training import load_policy
 from torchrl_aca.training.acceleration import capture, descend, make_adam
 from torchrl_aca.training.envs import make_vector_env
 from torchrl_aca.training.resume import resumed_config
@@ -119,5 +120,5 @@ def test_a_run_trains_stops_and_goes_on_and_its_policy_is_loaded_on_the_cpu(devi
     more = "optim.total_updates=60"
     train(*resumed_config(composed(f"resume={run_dir}", more), [more]))
     assert rows_of(run_dir / "eval.csv")[-1]["updates"] == "60"
-    policy, _ = load_policy(run_dir)
+    policy = load_policy(run_dir)
     assert {param.device.type for param in policy.parameters()} == {"cpu"}

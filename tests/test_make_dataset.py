@@ -15,11 +15,12 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from agents import load_policy, without_methods
+from agents import without_methods
 from data.generate import GeneratorConfig, make_dataset
 from recipe_cases import CONFIGS, rows_of, run, start
 from torchrl_aca.errors import DatasetError, RunError
 from torchrl_aca.offline import OfflineDataset
+from torchrl_aca.training import load_policy
 from torchrl_aca.training.checkpoint import read_checkpoint
 from torchrl_aca.training.config import checked
 from torchrl_aca.training.envs import make_env
@@ -149,7 +150,7 @@ def test_medium_replay_is_the_buffer_of_the_run_row_by_row(folder):
 def test_medium_samples_the_policy_that_the_run_ended_with(folder):
     dataset = OfflineDataset.load(folder / "medium")
     run_dir = folder / "sac"
-    policy, _ = load_policy(run_dir)
+    policy = load_policy(run_dir)
     with torch.no_grad():
         dist = policy.get_dist(dataset.data.select("observation"))
     loc, scale = dist.base_dist.base_dist.loc, dist.base_dist.base_dist.scale

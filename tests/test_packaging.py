@@ -42,7 +42,7 @@ ALLOWED = {
         "critic",
         "custom_critic",
     },
-    "langevin_actor": {"checks", "schedule", "chain", "actor"},
+    "langevin_actor": {"checks", "schedule", "chain", "critic", "actor"},
     "td_loss": {"checks", "functional"},
     "tuning": {"checks", "functional"},
     "loss": {
@@ -58,6 +58,7 @@ ALLOWED = {
     },
     "interop": {"functional", "critic"},
     "trainer": {"checks"},
+    "make": {"checks", "schedule", "critic", "actor", "loss"},
 }
 # What each room may import besides itself.
 ROOMS = {

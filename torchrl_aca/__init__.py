@@ -6,6 +6,7 @@ from torchrl_aca.actor import CriticGuidedDenoisingActor
 from torchrl_aca.critic import NoiseLevelCritic, NoiseLevelCriticBase
 from torchrl_aca.custom_critic import CustomCritic
 from torchrl_aca.loss import ACALoss
+from torchrl_aca.make import make_aca, make_aca_actor
 from torchrl_aca.schedule import NoiseSchedule
 
 __all__ = [
@@ -15,5 +16,7 @@ __all__ = [
     "NoiseLevelCritic",
     "NoiseLevelCriticBase",
     "NoiseSchedule",
+    "make_aca",
+    "make_aca_actor",
 ]
 __version__ = version("torchrl-aca")

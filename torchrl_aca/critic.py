@@ -127,7 +127,7 @@ class NoiseLevelCritic(NoiseLevelCriticBase):
     (:meth:`encode`), the level's once per level, and only the action's once per row.
 
     Args:
-        observation_dim: size of the observation vector.
+        observation_dim: size of the observation vector; with several, the sum of their sizes.
         action_dim: size ``A`` of the action vector.
 
     Keyword Args:
@@ -137,13 +137,15 @@ class NoiseLevelCritic(NoiseLevelCriticBase):
         activation: class (or factory) of an elementwise activation module. Default: ``nn.Mish``.
         embedding_dim: even number of sinusoidal level features. Default: 16.
         first_level: see :class:`NoiseLevelCriticBase`. Default: 1, the paper.
-        in_keys: observation, action and noise-level key.
+        in_keys: one or several observation keys, whose vectors are joined in this order, then the
+            action's and the noise level's key.
         out_keys: the value key.
         device: device of the parameters.
         dtype: dtype of the parameters; observations are cast to it.
 
     Raises:
-        ValueError: if a size is not positive or ``embedding_dim`` is odd.
+        ValueError: if a size is not positive, ``embedding_dim`` is odd or there are fewer than
+            three ``in_keys``; in a call, if observations are not ``observation_dim`` numbers.
 
     Examples:
         >>> critic = NoiseLevelCritic(17, 6)
@@ -168,8 +170,13 @@ class NoiseLevelCritic(NoiseLevelCriticBase):
         device: torch.device | str | None = None,
         dtype: torch.dtype | None = None,
     ) -> None:
-        observation_key, action_key, noise_level_key = in_keys
-        super().__init__([observation_key], action_key, noise_level_key, out_keys[0], first_level)
+        if isinstance(in_keys, str) or len(in_keys) < 3:
+            raise ValueError(
+                "NoiseLevelCritic expects in_keys=[*observation keys, action key, noise-level "
+                f"key], at least three, got {in_keys!r}."
+            )
+        *observation_keys, action_key, noise_level_key = in_keys
+        super().__init__(observation_keys, action_key, noise_level_key, out_keys[0], first_level)
         sizes = (observation_dim, action_dim, num_steps, num_critics, *num_cells)
         if min(sizes) < 1 or not num_cells or embedding_dim < 2 or embedding_dim % 2:
             raise ValueError(
@@ -196,7 +203,7 @@ class NoiseLevelCritic(NoiseLevelCriticBase):
         """First layer: each state's share ``(E, B, H)`` and each level's ``(E, levels, H)``."""
         first = self._first
         observation_weight, _, level_weight = self._first_weights()
-        observation = observations[0].to(first.weight.dtype)
+        observation = self._joined(observations).to(first.weight.dtype)
         num_indices = self.num_steps + self.first_level
         indices = torch.arange(num_indices, device=first.weight.device, dtype=first.weight.dtype)
         embedding = F.sinusoidal_embedding(indices, self.embedding_dim)
@@ -204,6 +211,17 @@ class NoiseLevelCritic(NoiseLevelCriticBase):
         embedding = self.level_out(self.activation(self.level_in(embedding)))
         state_share = observation.expand(self.num_critics, -1, -1) @ observation_weight
         return state_share, torch.baddbmm(first.bias, embedding, level_weight)
+
+    def _joined(self, observations: Sequence[Tensor]) -> Tensor:
+        """One vector of all observations, ``(B, O)``."""
+        sizes = [observation.shape[-1] for observation in observations]
+        if sum(sizes) != self.observation_dim:
+            raise ValueError(
+                f"NoiseLevelCritic has observation_dim={self.observation_dim}, got observations of "
+                f"{' + '.join(map(str, sizes))} numbers. Build it with observation_dim={sum(sizes)}"
+                f", or give it other in_keys than {self.in_keys}."
+            )
+        return observations[0] if len(observations) == 1 else torch.cat(tuple(observations), -1)
 
     def _evaluate(self, features: Any, action: Tensor, index: Tensor) -> Tensor:
         x = F.activate(self.activation, self._first_layer(features, action, index))

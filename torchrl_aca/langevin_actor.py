@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torchrl.data import Bounded
 
 from torchrl_aca import chain
 from torchrl_aca.actor import CriticGuidedDenoisingActor
 from torchrl_aca.checks import check_above, check_at_least
+from torchrl_aca.critic import NoiseLevelCritic
 from torchrl_aca.schedule import VarianceExplodingSchedule
 
-__all__ = ["AnnealedLangevinActor"]
+__all__ = ["AnnealedLangevinActor", "make_nclql_actor"]
 
 
 class AnnealedLangevinActor(CriticGuidedDenoisingActor):
@@ -103,3 +106,45 @@ class AnnealedLangevinActor(CriticGuidedDenoisingActor):
             tile_rows=self.tile_rows,
             run=self._run,
         )
+
+
+def make_nclql_actor(
+    observation_dim: int,
+    spec: Bounded,
+    *,
+    num_steps: int,
+    sigma_min: float,
+    sigma_max: float,
+    num_critics: int = 2,
+    num_cells: Sequence[int] = (256, 256, 256),
+    device: torch.device | str | None = None,
+    **actor: Any,
+) -> AnnealedLangevinActor:
+    """Builds an :class:`AnnealedLangevinActor` on a :class:`NoiseLevelCritic`.
+
+    Args:
+        observation_dim: size ``O`` of the observation vector.
+        spec: bounded spec of one env's action, of shape ``(A,)``.
+
+    Keyword Args:
+        num_steps: number ``T`` of noise levels.
+        sigma_min: noise of level 0; see :class:`VarianceExplodingSchedule`.
+        sigma_max: noise of level ``T``.
+        num_critics: number ``E`` of critics. Default: 2.
+        num_cells: widths of the critic's hidden layers. Default: three of 256.
+        device: device of the parameters.
+        actor: more keywords of the actor.
+
+    Raises:
+        ValueError: if a value is refused by one of the parts.
+    """
+    critic = NoiseLevelCritic(
+        observation_dim,
+        spec.shape[-1],
+        num_steps=num_steps,
+        num_critics=num_critics,
+        num_cells=num_cells,
+        device=device,
+    )
+    schedule = VarianceExplodingSchedule(num_steps, sigma_min, sigma_max)
+    return AnnealedLangevinActor(critic, schedule, spec=spec, **actor).to(device)

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
 from omegaconf import DictConfig, OmegaConf
 from pydantic import create_model
-from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from agents.aca import ACAOptim, ACASettings, make_aca
@@ -36,9 +34,7 @@ from agents.sdac import SDACOptim, SDACSettings, make_sdac
 from agents.variant import Variant
 from torchrl_aca.errors import RunError
 from torchrl_aca.training.agent import Agent
-from torchrl_aca.training.checkpoint import read_checkpoint, restore
 from torchrl_aca.training.config import RunConfig, Section, checked
-from torchrl_aca.training.envs import make_vector_env
 
 
 @dataclass(frozen=True)
@@ -117,32 +113,3 @@ def make_agent(cfg: RunConfig, env: EnvBase, device: torch.device) -> Agent:
         return AGENTS[cfg.algo.name].make(cfg, env, device)
     except ValueError as error:
         raise RunError(f"algo={cfg.algo.name} cannot be built: {error}") from error
-
-
-def load_policy(
-    run_dir: str | Path, device: str | torch.device = "cpu", updates: int | None = None
-) -> tuple[TensorDictModuleBase, RunConfig]:
-    """Returns the policy of a run, and the run's configuration.
-
-    Args:
-        run_dir: The run's directory.
-        device: Where the policy is put.
-        updates: After how many updates; one of the kept checkpoints. Default: the newest.
-
-    Raises:
-        RunError: If there is no run, or its checkpoint cannot be used.
-    """
-    return policy_of(read_checkpoint(Path(run_dir), updates), device)
-
-
-def policy_of(
-    checkpoint: Mapping[str, Any], device: str | torch.device = "cpu"
-) -> tuple[TensorDictModuleBase, RunConfig]:
-    """Returns the policy that a checkpoint holds, and the configuration of its run."""
-    stored = OmegaConf.create(checkpoint["config"])
-    recipe_keys = {*RunConfig.model_fields, *AGENTS[stored.algo.name].sections}
-    cfg = configured(OmegaConf.masked_copy(stored, [k for k in stored if k in recipe_keys]))
-    env = make_vector_env(cfg.env, 1, 0)
-    agent = make_agent(cfg, env, torch.device(device))
-    restore({"agent.loss": agent.state["loss"]}, checkpoint["parts"])
-    return agent.policy, cfg

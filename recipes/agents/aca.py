@@ -9,10 +9,10 @@ import torch
 from pydantic import Field, PlainSerializer, WrapValidator, model_validator
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
-from torchrl.objectives import SoftUpdate
 
+import torchrl_aca
 from agents.learning_rate import DecayOptim, linear_decay
-from torchrl_aca import ACALoss, CriticGuidedDenoisingActor, NoiseLevelCritic, NoiseSchedule
+from torchrl_aca import make_aca_actor
 from torchrl_aca.chain import check_levels
 from torchrl_aca.training.acceleration import capture, compiled, descend, make_adam
 from torchrl_aca.training.agent import Agent
@@ -24,12 +24,8 @@ from torchrl_aca.training.config import (
     Section,
     Widths,
 )
+from torchrl_aca.training.policy import PolicyBuilder
 
-SCHEDULES = {
-    "cosine": NoiseSchedule.cosine,
-    "linear": NoiseSchedule.linear,
-    "vp": NoiseSchedule.vp,
-}
 Candidates = Annotated[int, Field(ge=1, le=10**5)]
 
 
@@ -99,45 +95,23 @@ class ACAOptim(DecayOptim):
     alpha_lr: Positive
 
 
-def make_aca_loss(cfg: Any, env: EnvBase, device: torch.device) -> ACALoss:
-    """The critic, the actor that it guides, and their loss."""
+def actor_settings(cfg: Any) -> dict[str, Any]:
+    """The keywords of `make_aca_actor`."""
     settings, levels, auto = cfg.aca, cfg.aca.inference_levels, cfg.aca.auto_guidance
-    action_spec = env.action_spec_unbatched
-    critic = NoiseLevelCritic(
-        env.observation_spec["observation"].shape[-1],
-        action_spec.shape[-1],
-        num_steps=settings.num_steps,
-        num_critics=settings.num_critics,
-        num_cells=settings.num_cells,
-        first_level=settings.first_level,
-        device=device,
-    )
-    actor = CriticGuidedDenoisingActor(
-        critic,
-        SCHEDULES[settings.schedule](settings.num_steps),
-        spec=action_spec,
-        guidance_weight=settings.guidance_weight_init if auto else settings.guidance_weight,
-        num_candidates=settings.num_candidates,
-        num_inference_steps=settings.num_inference_steps if levels is None else None,
-        inference_levels=levels,
-        exploration_noise=settings.exploration_noise,
-        alpha_init=settings.alpha_init,
-        deterministic_draws=cfg.eval.draws,
-        compile_step=cfg.compile,
-    ).to(device)
-    loss = ACALoss(
-        actor,
-        num_target_candidates=settings.num_target_candidates,
-        target_value=settings.target_value,
-        temperature=settings.temperature,
-        guidance_weight="auto" if auto else "fixed",
-        guidance_weight_lr=settings.guidance_weight_lr,
-        noise_level_target=settings.noise_level_target,
-        target_entropy_scale=settings.target_entropy_scale,
-        reward_scale=settings.reward_scale,
-    )
-    loss.make_value_estimator(gamma=cfg.optim.gamma)
-    return loss
+    return {
+        "num_steps": settings.num_steps,
+        "schedule": settings.schedule,
+        "num_critics": settings.num_critics,
+        "num_cells": settings.num_cells,
+        "first_level": settings.first_level,
+        "guidance_weight": settings.guidance_weight_init if auto else settings.guidance_weight,
+        "num_candidates": settings.num_candidates,
+        "num_inference_steps": settings.num_inference_steps if levels is None else None,
+        "inference_levels": levels,
+        "exploration_noise": settings.exploration_noise,
+        "alpha_init": settings.alpha_init,
+        "deterministic_draws": cfg.eval.draws,
+    }
 
 
 def make_aca(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
@@ -146,11 +120,29 @@ def make_aca(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
     The four steps are functions of a batch alone, so that each can be captured as a CUDA graph;
     what changes from update to update, which of them to take and the learning rate, stays outside.
     """
-    settings, optim = cfg.aca, cfg.optim
-    loss = make_aca_loss(cfg, env, device)
-    target_update = SoftUpdate(loss, tau=optim.tau)
-    optimizer = make_adam(loss.qvalue_network.parameters(), optim.lr, cfg.cudagraphs)
-    alpha_optimizer = make_adam([loss.log_alpha], optim.alpha_lr, cfg.cudagraphs)
+    settings, optim, actor = cfg.aca, cfg.optim, actor_settings(cfg)
+    aca = torchrl_aca.make_aca(
+        env,
+        **actor,
+        compile_step=cfg.compile,
+        num_target_candidates=settings.num_target_candidates,
+        loss={
+            "target_value": settings.target_value,
+            "temperature": settings.temperature,
+            "guidance_weight": "auto" if settings.auto_guidance else "fixed",
+            "guidance_weight_lr": settings.guidance_weight_lr,
+            "noise_level_target": settings.noise_level_target,
+            "target_entropy_scale": settings.target_entropy_scale,
+            "reward_scale": settings.reward_scale,
+        },
+        gamma=optim.gamma,
+        tau=optim.tau,
+        lr=optim.lr,
+        alpha_lr=optim.alpha_lr,
+        make_optimizer=partial(make_adam, cudagraphs=cfg.cudagraphs),
+        device=device,
+    )
+    loss, optimizer, alpha_optimizer = aca.loss, aca.optimizer, aca.alpha_optimizer
     # The decay counts steps of the optimiser, of which an update takes one or two.
     scheduler = linear_decay(optimizer, optim, optim.lr, optim.lr_end)
     progress = Counters()
@@ -177,7 +169,7 @@ def make_aca(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
 
     @partial(capture, enabled=cfg.cudagraphs)
     def target_step(batch: TensorDictBase) -> None:
-        target_update.step()
+        aca.target_update.step()
 
     def update(batch: TensorDictBase) -> TensorDictBase:
         metrics = td_step(batch)
@@ -192,7 +184,7 @@ def make_aca(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
         return metrics
 
     return Agent(
-        loss.actor_network,
+        aca.actor,
         update,
         state={
             "loss": loss,
@@ -201,4 +193,5 @@ def make_aca(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
             "scheduler": scheduler,
             "progress": progress,
         },
+        policy_builder=PolicyBuilder.of(env, make_aca_actor, **actor),
     )

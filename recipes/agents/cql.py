@@ -10,7 +10,7 @@ from pydantic import Field
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
-from agents.ensemble import EnsembleSACSettings, make_critics, make_policy
+from agents.ensemble import EnsembleSACSettings, initialised, make_critics, policy_builder
 from agents.ensemble_steps import DelayedActor, EnsembleSteps, actor_interval, both
 from torchrl_aca.baselines import CalQLLoss, EnsembleCQLLoss
 from torchrl_aca.offline import return_bounds
@@ -19,6 +19,7 @@ from torchrl_aca.replay import FinishedEpisodes
 from torchrl_aca.training.acceleration import Step, capture, compiled, descend, make_adam
 from torchrl_aca.training.agent import Agent
 from torchrl_aca.training.config import Count, NonNegative, Optim, Positive, Section
+from torchrl_aca.training.policy import PolicyBuilder
 
 
 class CQLSettings(EnsembleSACSettings):
@@ -56,15 +57,17 @@ class CQLOptim(Optim):
 
 def make_cql(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
     """CQL; an update is a step of critics, actor and temperature on one batch, in both phases."""
-    loss = make_loss(EnsembleCQLLoss, cfg, env, device)
+    loss, builder = make_loss(EnsembleCQLLoss, cfg, env, device)
     steps = EnsembleSteps(loss, cfg)
     update = both(conservative_step(steps, cfg), steps.actor_step())
-    return Agent(loss.actor_network, update, steps.state, offline_update=update)
+    return Agent(
+        loss.actor_network, update, steps.state, offline_update=update, policy_builder=builder
+    )
 
 
 def make_calql(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
     """Cal-QL: CQL with a floor from the returns, so online only finished episodes are sampled."""
-    loss = make_loss(CalQLLoss, cfg, env, device)
+    loss, builder = make_loss(CalQLLoss, cfg, env, device)
     steps = EnsembleSteps(loss, cfg)
     update = both(conservative_step(steps, cfg), steps.actor_step())
 
@@ -81,6 +84,7 @@ def make_calql(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
         extra_keys=("mc_return",),
         rows=finished,
         offline_rows=with_bounds,
+        policy_builder=builder,
     )
 
 
@@ -91,7 +95,7 @@ def make_wsrl(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
     moments of the optimisers. An online update is one critic step; the actor's step sees the
     states of all batches since its last one.
     """
-    loss = make_loss(EnsembleCQLLoss, cfg, env, device)
+    loss, builder = make_loss(EnsembleCQLLoss, cfg, env, device)
     steps = EnsembleSteps(loss, cfg)
     interval = actor_interval(cfg.wsrl.actor_interval, cfg.optim.utd_ratio)
     # Each phase has an actor step of its own, because their batches differ in size.
@@ -100,16 +104,18 @@ def make_wsrl(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
         steps.critic_step(loss.td_loss), steps.actor_step(), interval, interval, device
     )
     state = {**steps.state, **update.state}
-    return Agent(loss.actor_network, update, state, offline_update=offline_update)
+    return Agent(
+        loss.actor_network, update, state, offline_update=offline_update, policy_builder=builder
+    )
 
 
 def make_loss(
     kind: type[EnsembleCQLLoss], cfg: Any, env: EnvBase, device: torch.device
-) -> EnsembleCQLLoss:
-    """The policy, the critics and their loss."""
-    settings = cfg.cql
+) -> tuple[EnsembleCQLLoss, PolicyBuilder]:
+    """The loss on a policy and critics, and how the policy is built."""
+    settings, builder = cfg.cql, policy_builder(cfg.cql, env)
     loss = kind(
-        make_policy(settings, env, device),
+        initialised(builder.build(device), settings),
         make_critics(settings, env, device),
         cql_weight=settings.weight,
         num_actions=settings.num_actions,
@@ -118,7 +124,7 @@ def make_loss(
         **settings.of_loss(),
     ).to(device)
     loss.make_value_estimator(gamma=cfg.optim.gamma)
-    return loss
+    return loss, builder
 
 
 def conservative_step(steps: EnsembleSteps, cfg: Any) -> Step:

@@ -9,11 +9,12 @@ from pydantic import Field, model_validator
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
-from agents.diffusion import DiffusionOptim, DiffusionSettings, make_policy, make_steps
-from torchrl_aca.baselines import DACERLoss
+from agents.diffusion import DiffusionOptim, DiffusionSettings, make_steps, policy_builder
+from torchrl_aca.baselines import DACERLoss, DiffusionPolicy
 from torchrl_aca.training.acceleration import descend, make_adam
 from torchrl_aca.training.agent import Agent
 from torchrl_aca.training.config import Count, NonNegative, Positive
+from torchrl_aca.training.policy import PolicyBuilder
 
 
 class DACERSettings(DiffusionSettings):
@@ -40,19 +41,23 @@ class DACEROptim(DiffusionOptim):
     alpha_lr: Positive
 
 
-def make_dacer_loss(cfg: Any, env: EnvBase, device: torch.device) -> DACERLoss:
-    """The critics, the policy that climbs them, and their loss."""
+def dacer_policy(cfg: Any, env: EnvBase) -> PolicyBuilder:
+    """The policy, with critics that tell mean and standard deviation."""
     settings = cfg.dacer
-    policy = make_policy(
+    return policy_builder(
         cfg,
         settings,
         env,
-        device,
         critic={"num_outputs": 2},
         exploration_noise=settings.exploration_noise,
         alpha_init=settings.alpha_init,
         clip_action=True,
     )
+
+
+def make_dacer_loss(cfg: Any, policy: DiffusionPolicy) -> DACERLoss:
+    """The loss of the critics and of the policy that climbs them."""
+    settings = cfg.dacer
     loss = DACERLoss(
         policy,
         target_entropy_scale=settings.target_entropy_scale,
@@ -67,8 +72,8 @@ def make_dacer_loss(cfg: Any, env: EnvBase, device: torch.device) -> DACERLoss:
 
 def make_dacer(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
     """DACER, in its authors' order: the policy climbs the critics as they were before."""
-    settings = cfg.dacer
-    loss = make_dacer_loss(cfg, env, device)
+    settings, builder = cfg.dacer, dacer_policy(cfg, env)
+    loss = make_dacer_loss(cfg, builder.build(device, compile_step=cfg.compile))
     steps = make_steps(cfg, loss)
     alpha_optimizer = make_adam([loss.log_alpha], cfg.optim.alpha_lr, cfg.cudagraphs)
 
@@ -90,4 +95,4 @@ def make_dacer(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
         return metrics
 
     state = {**steps.state, "alpha_optimizer": alpha_optimizer}
-    return Agent(loss.actor_network, update, state=state)
+    return Agent(loss.actor_network, update, state=state, policy_builder=builder)

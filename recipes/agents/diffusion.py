@@ -1,26 +1,24 @@
-"""What the diffusion-policy baselines share: settings, networks, and the steps of an update."""
+"""What the diffusion-policy baselines share: settings, policy, and the steps of an update."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, Literal
 
-import torch
 from pydantic import Field
 from tensordict import TensorDictBase
-from torch import nn
 from torchrl.envs import EnvBase
 from torchrl.objectives import SoftUpdate
 
 from agents.learning_rate import DecayOptim, linear_decay
-from torchrl_aca import NoiseSchedule
-from torchrl_aca.baselines import DiffusionPolicy, DiffusionPolicyLoss, NoiseNetwork, TwinCritic
+from torchrl_aca.baselines import DiffusionPolicyLoss, make_diffusion_policy
 from torchrl_aca.training.acceleration import Step, capture, compiled, descend, make_adam
 from torchrl_aca.training.agent import Stateful
 from torchrl_aca.training.checkpoint import Counters
 from torchrl_aca.training.config import Count, NonNegative, Positive, Section, Widths
+from torchrl_aca.training.policy import PolicyBuilder
 
 Candidates = Annotated[int, Field(ge=1, le=10**5)]
 Activation = Literal["Mish", "ReLU", "GELU"]
@@ -47,53 +45,27 @@ class DiffusionOptim(DecayOptim):
     actor_lr_end: NonNegative
 
 
-def make_schedule(settings: DiffusionSettings) -> NoiseSchedule:
-    """The noise schedule; the linear one is so many times linspace(1e-4, 0.999)."""
-    if settings.schedule == "linear":
-        return NoiseSchedule.linear(settings.num_steps, 1e-4, 0.999, settings.linear_scale)
-    return getattr(NoiseSchedule, settings.schedule)(settings.num_steps)
-
-
-def make_policy(
-    cfg: Any,
-    settings: DiffusionSettings,
-    env: EnvBase,
-    device: torch.device,
-    *,
-    schedule: NoiseSchedule | Sequence[float] | None = None,
-    network: dict[str, Any] | None = None,
-    critic: dict[str, Any] | None = None,
-    **how: Any,
-) -> DiffusionPolicy:
-    """The policy with its network and its critics.
+def policy_builder(
+    cfg: Any, settings: DiffusionSettings, env: EnvBase, **more: Any
+) -> PolicyBuilder:
+    """How the policy, its network and its critics are built.
 
     Args:
         cfg: The whole configuration.
         settings: The method's own section.
         env: Tells sizes and bounds.
-        device: Where the parameters are.
-        schedule: Of the chain; the settings' own if None.
-        network: More arguments of the policy's network.
-        critic: More arguments of the critics.
-        how: More arguments of the policy.
+        more: Other keywords of `make_diffusion_policy`.
     """
-    action_spec = env.action_spec_unbatched
-    sizes = env.observation_spec["observation"].shape[-1], action_spec.shape[-1]
-    mlp = {
+    shared = {
+        "num_steps": settings.num_steps,
+        "schedule": settings.schedule,
+        "linear_scale": settings.linear_scale,
         "num_cells": settings.num_cells,
-        "activation": getattr(nn, settings.activation),
-        "device": device,
+        "activation": settings.activation,
+        "initial_scale": settings.initial_scale,
+        "deterministic_draws": cfg.eval.draws,
     }
-    return DiffusionPolicy(
-        NoiseNetwork(*sizes, num_steps=settings.num_steps, **mlp, **(network or {})),
-        make_schedule(settings) if schedule is None else schedule,
-        critic=TwinCritic(*sizes, **mlp, **(critic or {})),
-        spec=action_spec,
-        initial_scale=settings.initial_scale,
-        deterministic_draws=cfg.eval.draws,
-        compile_step=cfg.compile,
-        **how,
-    ).to(device)
+    return PolicyBuilder.of(env, make_diffusion_policy, **{**shared, **more})
 
 
 @dataclass

@@ -9,8 +9,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
-from agents.diffusion import DiffusionOptim, DiffusionSettings, make_policy, make_steps
-from torchrl_aca.baselines import DIPOLoss
+from agents.diffusion import DiffusionOptim, DiffusionSettings, make_steps, policy_builder
+from torchrl_aca.baselines import DiffusionPolicy, DIPOLoss
 from torchrl_aca.training.acceleration import capture
 from torchrl_aca.training.agent import Agent
 from torchrl_aca.training.config import Count, Positive
@@ -31,12 +31,11 @@ class DIPOOptim(DiffusionOptim):
     max_grad_norm: Positive
 
 
-def make_dipo_loss(cfg: Any, env: EnvBase, device: torch.device) -> DIPOLoss:
-    """The critics, the policy that imitates improved actions, and their loss."""
+def make_dipo_loss(cfg: Any, policy: DiffusionPolicy) -> DIPOLoss:
+    """The loss of the critics and of the policy that imitates improved actions."""
     settings = cfg.dipo
-    network = {"embedding": "sinusoidal", "embedding_dim": 32}
     loss = DIPOLoss(
-        make_policy(cfg, settings, env, device, network=network),
+        policy,
         num_gradient_steps=settings.num_gradient_steps,
         action_lr=settings.action_lr,
         action_max_norm=settings.action_max_norm,
@@ -53,7 +52,9 @@ def make_dipo(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
     The better actions go into the batch, from where the loop writes them to the rows in the buffer.
     """
     settings = cfg.dipo
-    loss = make_dipo_loss(cfg, env, device)
+    network = {"embedding": "sinusoidal", "embedding_dim": 32}
+    builder = policy_builder(cfg, settings, env, network=network)
+    loss = make_dipo_loss(cfg, builder.build(device, compile_step=cfg.compile))
     best_action = loss.tensor_keys.best_action
     steps = make_steps(cfg, loss)
     max_norm = cfg.optim.max_grad_norm
@@ -82,7 +83,13 @@ def make_dipo(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
         steps.progress.updates += 1
         return metrics
 
-    return Agent(loss.actor_network, update, state=steps.state, rewrites={best_action: "action"})
+    return Agent(
+        loss.actor_network,
+        update,
+        state=steps.state,
+        rewrites={best_action: "action"},
+        policy_builder=builder,
+    )
 
 
 def cut_gradients(optimizer: torch.optim.Optimizer, max_norm: float, stacked: bool) -> None:

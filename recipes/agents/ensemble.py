@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar, Literal
+from collections.abc import Callable
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 import torch
 from pydantic import Field, model_validator
+from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.envs import EnvBase
-from torchrl.modules import MLP, ProbabilisticActor, ValueOperator
+from torchrl.modules import ValueOperator
 
-from agents.gaussian_policy import make_gaussian_policy
-from torchrl_aca.baselines import EnsembleMLP
+from torchrl_aca.baselines import EnsembleMLP, make_gaussian_policy
 from torchrl_aca.training.config import Count, Positive, Section, Widths
+from torchrl_aca.training.policy import PolicyBuilder
 
 INITIALISERS = {"xavier_uniform": nn.init.xavier_uniform_, "orthogonal": nn.init.orthogonal_}
+Network = TypeVar("Network", bound=nn.Module)
 
 
 class EnsembleSettings(Section):
@@ -71,42 +74,30 @@ class EnsembleSACSettings(EnsembleSettings):
 # --- networks -------------------------------------------------------------------------------------
 
 
-def make_network(
+def actor_mlp(settings: EnsembleSettings) -> dict[str, Any]:
+    """The keywords of the actor's network, and of others of its kind."""
+    return {"num_cells": settings.num_cells, "layer_norm": settings.actor_layer_norm}
+
+
+def policy_builder(
     settings: EnsembleSettings,
-    num_in: int,
-    num_out: int,
-    last_hidden_gain: float,
-    device: torch.device,
-) -> MLP:
-    """A network of the actor's kind."""
-    norm = {}
-    if settings.actor_layer_norm:
-        kwargs = [{"normalized_shape": cells, "eps": 1e-6} for cells in settings.num_cells]
-        norm = {"norm_class": nn.LayerNorm, "norm_kwargs": kwargs}
-    network = MLP(
-        num_in,
-        num_out,
-        num_cells=settings.num_cells,
-        activation_class=nn.ReLU,
-        device=device,
-        **norm,
-    )
-    layers = [layer for layer in network if isinstance(layer, nn.Linear)]
+    env: EnvBase,
+    factory: Callable[..., TensorDictModuleBase] = make_gaussian_policy,
+) -> PolicyBuilder:
+    """How the Gaussian policy is built."""
+    bounds = {"log_std_min": settings.log_std_min, "log_std_max": settings.log_std_max}
+    return PolicyBuilder.of(env, factory, **actor_mlp(settings), **bounds)
+
+
+def initialised(
+    network: Network, settings: EnsembleSettings, last_hidden_gain: float | None = None
+) -> Network:
+    """Draws the weights of a policy or an MLP anew; the biases are zero."""
+    layers = [layer for layer in network.modules() if isinstance(layer, nn.Linear)]
     for layer in layers:
         nn.init.zeros_(layer.bias)
     initialise([layer.weight.unsqueeze(0) for layer in layers], settings, last_hidden_gain)
     return network
-
-
-def make_policy(
-    settings: EnsembleSettings, env: EnvBase, device: torch.device
-) -> ProbabilisticActor:
-    """The tanh-squashed Gaussian."""
-    spec = env.action_spec_unbatched
-    num_in = env.observation_spec["observation"].shape[-1]
-    gain = settings.last_hidden_gain
-    network = make_network(settings, num_in, 2 * spec.shape[-1], gain, device)
-    return make_gaussian_policy(network, spec, settings.log_std_min, settings.log_std_max, device)
 
 
 def make_critics(settings: EnsembleSettings, env: EnvBase, device: torch.device) -> ValueOperator:
@@ -118,15 +109,17 @@ def make_critics(settings: EnsembleSettings, env: EnvBase, device: torch.device)
         layer_norm=settings.critic_layer_norm,
         device=device,
     )
-    initialise(network.weights, settings, settings.last_hidden_gain)
+    initialise(network.weights, settings)
     return ValueOperator(network, in_keys=["observation", "action"])
 
 
 def initialise(
-    weights: list[torch.Tensor], settings: EnsembleSettings, last_hidden_gain: float
+    weights: list[torch.Tensor], settings: EnsembleSettings, last_hidden_gain: float | None = None
 ) -> None:
     """Draws stacks of weights, first layer to last; the last hidden one has a gain of its own."""
     fill = INITIALISERS[settings.init]
+    if last_hidden_gain is None:
+        last_hidden_gain = settings.last_hidden_gain
     for layer, weight in enumerate(weights):
         gain = last_hidden_gain if layer == len(weights) - 2 else settings.gain
         for member in weight:

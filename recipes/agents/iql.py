@@ -12,12 +12,18 @@ from torchrl.envs import EnvBase
 from torchrl.modules import ValueOperator
 from torchrl.objectives import SoftUpdate
 
-from agents.ensemble import EnsembleSettings, make_critics, make_network
-from agents.gaussian_policy import make_clipped_policy
-from torchrl_aca.baselines import EnsembleIQLLoss
+from agents.ensemble import (
+    EnsembleSettings,
+    actor_mlp,
+    initialised,
+    make_critics,
+    policy_builder,
+)
+from torchrl_aca.baselines import EnsembleIQLLoss, make_clipped_gaussian_policy, make_mlp
 from torchrl_aca.training.acceleration import capture, compiled, make_adam
 from torchrl_aca.training.agent import Agent
 from torchrl_aca.training.config import Optim, Positive
+from torchrl_aca.training.policy import PolicyBuilder
 
 
 class IQLSettings(EnsembleSettings):
@@ -43,7 +49,8 @@ def make_iql(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
     The three losses have no parameter in common, so one backward pass through their sum gives each
     part its own gradient, all from the parameters before the step, as in WSRL's code.
     """
-    loss = make_iql_loss(cfg, env, device)
+    builder = policy_builder(cfg.iql, env, make_clipped_gaussian_policy)
+    loss = make_iql_loss(cfg, builder, env, device)
     target_update = SoftUpdate(loss, tau=cfg.optim.tau)
     optimizer = make_adam(loss.parameters(), cfg.optim.lr, cfg.cudagraphs)
     evaluate_loss = compiled(loss, cfg.compile)
@@ -58,20 +65,19 @@ def make_iql(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
         return losses.detach()
 
     state = {"loss": loss, "optimizer": optimizer}
-    return Agent(loss.actor_network, update, state, offline_update=update)
+    return Agent(loss.actor_network, update, state, offline_update=update, policy_builder=builder)
 
 
-def make_iql_loss(cfg: Any, env: EnvBase, device: torch.device) -> EnsembleIQLLoss:
+def make_iql_loss(
+    cfg: Any, builder: PolicyBuilder, env: EnvBase, device: torch.device
+) -> EnsembleIQLLoss:
     """The policy, the critics, the state value and their loss."""
-    settings, spec = cfg.iql, env.action_spec_unbatched
-    num_in = env.observation_spec["observation"].shape[-1]
-    gain = settings.actor_last_hidden_gain
-    actor_network = make_network(settings, num_in, spec.shape[-1], gain, device)
-    value = make_network(settings, num_in, 1, settings.last_hidden_gain, device)
+    settings = cfg.iql
+    policy = initialised(builder.build(device), settings, settings.actor_last_hidden_gain)
+    value = make_mlp(builder.observation_dim, 1, **actor_mlp(settings), device=device)
+    value = initialised(value, settings)
     loss = EnsembleIQLLoss(
-        make_clipped_policy(
-            actor_network, spec, settings.log_std_min, settings.log_std_max, device
-        ),
+        policy,
         make_critics(settings, env, device),
         ValueOperator(value, in_keys=["observation"]),
         expectile=settings.expectile,

@@ -11,12 +11,12 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.objectives import SoftUpdate
 
-from torchrl_aca import ACALoss, NoiseLevelCritic
-from torchrl_aca.langevin_actor import AnnealedLangevinActor
-from torchrl_aca.schedule import VarianceExplodingSchedule
+from torchrl_aca import ACALoss
+from torchrl_aca.langevin_actor import make_nclql_actor
 from torchrl_aca.training.acceleration import capture, compiled, descend, make_adam
 from torchrl_aca.training.agent import Agent
 from torchrl_aca.training.config import NonNegative, Optim, Positive, Section, Widths
+from torchrl_aca.training.policy import PolicyBuilder
 
 
 class NCLQLSettings(Section):
@@ -47,37 +47,32 @@ class NCLQLOptim(Optim):
     lr: Positive
 
 
-def make_nclql_loss(cfg: Any, env: EnvBase, device: torch.device) -> ACALoss:
-    """The critic, the actor that follows it, and ACA's loss with what differs."""
-    settings, action_spec = cfg.nclql, env.action_spec_unbatched
-    critic = NoiseLevelCritic(
-        env.observation_spec["observation"].shape[-1],
-        action_spec.shape[-1],
+def nclql_policy(cfg: Any, env: EnvBase) -> PolicyBuilder:
+    """The actor with the critic that it follows."""
+    settings = cfg.nclql
+    return PolicyBuilder.of(
+        env,
+        make_nclql_actor,
         num_steps=settings.num_steps,
+        sigma_min=settings.sigma_min,
+        sigma_max=settings.sigma_max,
         num_critics=settings.num_critics,
         num_cells=settings.num_cells,
-        device=device,
-    )
-    actor = AnnealedLangevinActor(
-        critic,
-        VarianceExplodingSchedule(settings.num_steps, settings.sigma_min, settings.sigma_max),
-        spec=action_spec,
         steps_per_level=settings.steps_per_level,
         step_size=settings.step_size,
         guidance_weight=settings.guidance_weight,
         normalize_gradient=settings.normalize_gradient,
         num_candidates=settings.num_candidates,
         deterministic_draws=cfg.eval.draws,
-        compile_step=cfg.compile,
-    ).to(device)
-    loss = ACALoss(actor, noise_level_target="target", reward_scale=settings.reward_scale)
-    loss.make_value_estimator(gamma=cfg.optim.gamma)
-    return loss
+    )
 
 
 def make_nclql(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
     """NC-LQL: in every update a TD step and a noise-level step, then a move of the targets."""
-    loss = make_nclql_loss(cfg, env, device)
+    builder = nclql_policy(cfg, env)
+    actor = builder.build(device, compile_step=cfg.compile)
+    loss = ACALoss(actor, noise_level_target="target", reward_scale=cfg.nclql.reward_scale)
+    loss.make_value_estimator(gamma=cfg.optim.gamma)
     target_update = SoftUpdate(loss, tau=cfg.optim.tau)
     optimizer = make_adam(loss.qvalue_network.parameters(), cfg.optim.lr, cfg.cudagraphs)
     # The chain compiles its own step, so it is drawn before the compiled loss.
@@ -93,4 +88,5 @@ def make_nclql(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
         target_update.step()
         return metrics
 
-    return Agent(loss.actor_network, update, state={"loss": loss, "optimizer": optimizer})
+    state = {"loss": loss, "optimizer": optimizer}
+    return Agent(loss.actor_network, update, state, policy_builder=builder)

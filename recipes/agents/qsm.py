@@ -8,10 +8,11 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
-from agents.diffusion import Candidates, DiffusionSettings, make_policy, make_steps
-from torchrl_aca.baselines import DiffusionPolicy, QSMLoss
+from agents.diffusion import Candidates, DiffusionSettings, make_steps, policy_builder
+from torchrl_aca.baselines import QSMLoss
 from torchrl_aca.training.agent import Agent
 from torchrl_aca.training.config import NonNegative, Positive
+from torchrl_aca.training.policy import PolicyBuilder
 
 
 class QSMSettings(DiffusionSettings):
@@ -25,7 +26,7 @@ class QSMSettings(DiffusionSettings):
     gradient_of: Literal["min", "mean"]
 
 
-def make_qsm_policy(cfg: Any, env: EnvBase, device: torch.device) -> DiffusionPolicy:
+def qsm_policy(cfg: Any, env: EnvBase) -> PolicyBuilder:
     """The policy: annealed Langevin steps along a score, or a chain of DDPM."""
     settings = cfg.qsm
     how = {
@@ -36,17 +37,17 @@ def make_qsm_policy(cfg: Any, env: EnvBase, device: torch.device) -> DiffusionPo
     if settings.sampler == "langevin":
         steps = settings.num_steps
         sizes, network = [1 - step / steps for step in range(steps)], {"embedding": "none"}
-        return make_policy(cfg, settings, env, device, schedule=sizes, network=network, **how)
+        return policy_builder(cfg, settings, env, schedule=sizes, network=network, **how)
     # The authors' chain: variance beta, and the action itself clipped rather than its estimate.
     how.update(clip_denoised=False, clip_step=True, variance="beta")
-    return make_policy(cfg, settings, env, device, **how)
+    return policy_builder(cfg, settings, env, **how)
 
 
 def make_qsm(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
     """QSM: a step of the critics, then one of the policy with the new critics."""
-    settings = cfg.qsm
+    settings, builder = cfg.qsm, qsm_policy(cfg, env)
     loss = QSMLoss(
-        make_qsm_policy(cfg, env, device),
+        builder.build(device, compile_step=cfg.compile),
         score_scale=settings.score_scale,
         gradient_of=settings.gradient_of,
         num_target_candidates=settings.num_target_candidates,
@@ -64,4 +65,4 @@ def make_qsm(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
         steps.progress.updates += 1
         return metrics
 
-    return Agent(loss.actor_network, update, state=steps.state)
+    return Agent(loss.actor_network, update, state=steps.state, policy_builder=builder)

@@ -9,8 +9,8 @@ from pydantic import Field, model_validator
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
-from agents.diffusion import Candidates, DiffusionSettings, make_policy, make_steps
-from torchrl_aca.baselines import QVPOLoss
+from agents.diffusion import Candidates, DiffusionSettings, make_steps, policy_builder
+from torchrl_aca.baselines import DiffusionPolicy, QVPOLoss
 from torchrl_aca.baselines.qvpo import entropy_coefficient
 from torchrl_aca.training.agent import Agent
 from torchrl_aca.training.config import Count, NonNegative
@@ -42,10 +42,9 @@ class QVPOSettings(DiffusionSettings):
         return entropy_coefficient(update, *ends, self.entropy_updates)
 
 
-def make_qvpo_loss(cfg: Any, env: EnvBase, device: torch.device) -> QVPOLoss:
-    """The policy, its critics, and their loss."""
+def make_qvpo_loss(cfg: Any, policy: DiffusionPolicy) -> QVPOLoss:
+    """The loss of the policy and its critics."""
     settings = cfg.qvpo
-    policy = make_policy(cfg, settings, env, device, num_candidates=settings.num_candidates)
     loss = QVPOLoss(
         policy,
         weight=settings.weight,
@@ -60,7 +59,8 @@ def make_qvpo_loss(cfg: Any, env: EnvBase, device: torch.device) -> QVPOLoss:
 def make_qvpo(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
     """QVPO: a step of the critics, then one of the policy with the new critics."""
     settings = cfg.qvpo
-    loss = make_qvpo_loss(cfg, env, device)
+    builder = policy_builder(cfg, settings, env, num_candidates=settings.num_candidates)
+    loss = make_qvpo_loss(cfg, builder.build(device, compile_step=cfg.compile))
     keys = loss.tensor_keys
 
     def prepare_actor(batch: TensorDictBase) -> None:
@@ -80,4 +80,4 @@ def make_qvpo(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
         steps.progress.updates += 1
         return metrics
 
-    return Agent(loss.average_actor_network, update, state=steps.state)
+    return Agent(loss.average_actor_network, update, state=steps.state, policy_builder=builder)

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import torch
 from torchrl.envs import EnvBase
 
-from agents.ensemble import EnsembleSACSettings, make_critics, make_policy
+from agents.ensemble import EnsembleSACSettings, initialised, make_critics, policy_builder
 from agents.ensemble_steps import DelayedActor, EnsembleSteps, actor_interval
 from torchrl_aca.baselines import EnsembleSACLoss
 from torchrl_aca.training.agent import Agent
@@ -41,7 +41,13 @@ def make_rlpd(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
     critic step takes a batch as the loop has sampled it.
     """
     settings = cfg.rlpd
-    loss = make_rlpd_loss(cfg, env, device)
+    builder = policy_builder(settings, env)
+    loss = EnsembleSACLoss(
+        initialised(builder.build(device), settings),
+        make_critics(settings, env, device),
+        **settings.of_loss(),
+    ).to(device)
+    loss.make_value_estimator(gamma=cfg.optim.gamma)
     steps = EnsembleSteps(loss, cfg)
     interval = actor_interval(settings.actor_interval, cfg.optim.utd_ratio)
     update = DelayedActor(
@@ -51,16 +57,5 @@ def make_rlpd(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
         settings.num_actor_batches or interval,
         device,
     )
-    return Agent(loss.actor_network, update, state={**steps.state, **update.state})
-
-
-def make_rlpd_loss(cfg: Any, env: EnvBase, device: torch.device) -> EnsembleSACLoss:
-    """The policy, the critics and their loss."""
-    settings = cfg.rlpd
-    loss = EnsembleSACLoss(
-        make_policy(settings, env, device),
-        make_critics(settings, env, device),
-        **settings.of_loss(),
-    ).to(device)
-    loss.make_value_estimator(gamma=cfg.optim.gamma)
-    return loss
+    state = {**steps.state, **update.state}
+    return Agent(loss.actor_network, update, state, policy_builder=builder)

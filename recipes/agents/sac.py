@@ -9,14 +9,16 @@ import torch
 from pydantic import model_validator
 from tensordict import TensorDictBase
 from torch import nn
+from torchrl.data import Bounded
 from torchrl.envs import EnvBase
-from torchrl.modules import MLP, ValueOperator
+from torchrl.modules import ValueOperator
 from torchrl.objectives import SACLoss, SoftUpdate
 
-from agents.gaussian_policy import log_half_range, make_gaussian_policy
+from torchrl_aca.baselines import make_gaussian_policy, make_mlp
 from torchrl_aca.training.acceleration import capture, compiled, make_adam
 from torchrl_aca.training.agent import Agent
 from torchrl_aca.training.config import Optim, Positive, Section, Widths
+from torchrl_aca.training.policy import PolicyBuilder
 
 
 class SACSettings(Section):
@@ -49,20 +51,12 @@ class SACOptim(Optim):
 def make_sac(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
     """SAC with a tanh-squashed Gaussian, two critics and a learned temperature."""
     settings = cfg.sac
-    action_spec = env.action_spec_unbatched
-    observation_dim = env.observation_spec["observation"].shape[-1]
-    action_dim = action_spec.shape[-1]
-    activation = getattr(nn, settings.activation)
-    mlp = {"num_cells": settings.num_cells, "activation_class": activation, "device": device}
-    policy = make_gaussian_policy(
-        MLP(in_features=observation_dim, out_features=2 * action_dim, **mlp),
-        action_spec,
-        settings.log_std_min,
-        settings.log_std_max,
-        device,
-    )
+    mlp = {"num_cells": settings.num_cells, "activation": settings.activation}
+    bounds = {"log_std_min": settings.log_std_min, "log_std_max": settings.log_std_max}
+    builder = PolicyBuilder.of(env, make_gaussian_policy, **mlp, **bounds)
+    policy, action_dim = builder.build(device), builder.spec.shape[-1]
     critic = ValueOperator(
-        MLP(in_features=observation_dim + action_dim, out_features=1, **mlp),
+        make_mlp(builder.observation_dim + action_dim, 1, **mlp, device=device),
         in_keys=["observation", "action"],
     )
     loss = SACLoss(
@@ -72,7 +66,7 @@ def make_sac(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
         loss_function="l2",
         alpha_init=settings.alpha_init,
         # The policy's density is of actions in env units; the target is meant for [-1, 1].
-        target_entropy=-settings.target_entropy_scale * action_dim + log_half_range(action_spec),
+        target_entropy=-settings.target_entropy_scale * action_dim + log_half_range(builder.spec),
     ).to(device)
     loss.make_value_estimator(gamma=cfg.optim.gamma)
     target_update = SoftUpdate(loss, tau=cfg.optim.tau)
@@ -92,4 +86,10 @@ def make_sac(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
         target_update.step()
         return losses.detach()
 
-    return Agent(policy, update, state={"loss": loss, "optimizer": optimizer})
+    state = {"loss": loss, "optimizer": optimizer}
+    return Agent(policy, update, state, policy_builder=builder)
+
+
+def log_half_range(action_spec: Bounded) -> float:
+    """Returns what the entropy in env units is above that of the same actions in [-1, 1]."""
+    return ((action_spec.space.high - action_spec.space.low) / 2).log().sum().item()

@@ -13,13 +13,14 @@ from agents.diffusion import (
     Candidates,
     DiffusionOptim,
     DiffusionSettings,
-    make_policy,
     make_steps,
+    policy_builder,
 )
-from torchrl_aca.baselines import SDACLoss
+from torchrl_aca.baselines import DiffusionPolicy, SDACLoss
 from torchrl_aca.training.acceleration import capture, descend, make_adam
 from torchrl_aca.training.agent import Agent
 from torchrl_aca.training.config import Count, NonNegative, Positive
+from torchrl_aca.training.policy import PolicyBuilder
 
 
 class SDACSettings(DiffusionSettings):
@@ -41,18 +42,22 @@ class SDACOptim(DiffusionOptim):
     alpha_lr: Positive
 
 
-def make_sdac_loss(cfg: Any, env: EnvBase, device: torch.device) -> SDACLoss:
-    """The policy, its critics, and their loss."""
+def sdac_policy(cfg: Any, env: EnvBase) -> PolicyBuilder:
+    """The policy, whose exploration noise follows the temperature."""
     settings = cfg.sdac
-    policy = make_policy(
+    return policy_builder(
         cfg,
         settings,
         env,
-        device,
         num_candidates=settings.num_candidates,
         exploration_noise=settings.exploration_noise,
         alpha_init=settings.alpha_init,
     )
+
+
+def make_sdac_loss(cfg: Any, policy: DiffusionPolicy) -> SDACLoss:
+    """The loss of the policy and its critics."""
+    settings = cfg.sdac
     loss = SDACLoss(
         policy,
         num_proposals=settings.num_proposals,
@@ -67,8 +72,8 @@ def make_sdac_loss(cfg: Any, env: EnvBase, device: torch.device) -> SDACLoss:
 
 def make_sdac(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
     """SDAC, in its authors' order: the policy learns from the critics as they were before."""
-    settings = cfg.sdac
-    loss = make_sdac_loss(cfg, env, device)
+    settings, builder = cfg.sdac, sdac_policy(cfg, env)
+    loss = make_sdac_loss(cfg, builder.build(device, compile_step=cfg.compile))
     keys = loss.tensor_keys
 
     def prepare_actor(batch: TensorDictBase) -> None:
@@ -94,4 +99,4 @@ def make_sdac(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
         return metrics
 
     state = {**steps.state, "alpha_optimizer": alpha_optimizer}
-    return Agent(loss.average_actor_network, update, state=state)
+    return Agent(loss.average_actor_network, update, state=state, policy_builder=builder)

@@ -13,8 +13,8 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
-from agents import load_policy
 from torchrl_aca.errors import RunError
+from torchrl_aca.training import load_policy
 from torchrl_aca.training.checkpoint import read_checkpoint
 
 Episode = dict[str, Any]  # keywords of `DatasetWriter.add_episode`
@@ -45,7 +45,7 @@ def uniform_actions(env: gym.Env, seed: int) -> Callable[[np.ndarray], np.ndarra
 
 def sampled_actions(run_dir: Path, seed: int) -> Callable[[np.ndarray], np.ndarray]:
     """The stochastic policy that a run ended with."""
-    policy, _ = load_policy(run_dir)
+    policy = load_policy(run_dir)
     torch.manual_seed(seed)
 
     def act(observation: np.ndarray) -> np.ndarray:

@@ -7,7 +7,13 @@ from torchrl_aca.baselines.diffusion_policy import DiffusionPolicy
 from torchrl_aca.baselines.dipo import DIPOLoss
 from torchrl_aca.baselines.ensemble import EnsembleMLP
 from torchrl_aca.baselines.ensemble_sac import EnsembleSACLoss
+from torchrl_aca.baselines.gaussian_policy import (
+    make_clipped_gaussian_policy,
+    make_gaussian_policy,
+    make_mlp,
+)
 from torchrl_aca.baselines.iql import EnsembleIQLLoss
+from torchrl_aca.baselines.make_diffusion_policy import make_diffusion_policy
 from torchrl_aca.baselines.networks import NoiseNetwork, TwinCritic
 from torchrl_aca.baselines.qsm import QSMLoss
 from torchrl_aca.baselines.qvpo import QVPOLoss
@@ -28,4 +34,8 @@ __all__ = [
     "QVPOLoss",
     "SDACLoss",
     "TwinCritic",
+    "make_clipped_gaussian_policy",
+    "make_diffusion_policy",
+    "make_gaussian_policy",
+    "make_mlp",
 ]

@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 
 from torchrl_aca.replay import transitions
+from torchrl_aca.training.policy import PolicyBuilder
 
 Rows = Callable[[TensorDictBase], TensorDictBase]
 Update = Callable[[TensorDictBase], TensorDictBase]
@@ -47,6 +48,8 @@ class Agent:
             its `extra_keys`; None: it has them already.
         rewrites: Entries of a row that `update` changes in its batch, and the loop then in the
             buffer; each with the entry of the transition that it begins as.
+        policy_builder: Builds `policy` anew, without weights, for `load_policy`; None: the run
+            writes no policies beside its checkpoints.
     """
 
     policy: TensorDictModuleBase
@@ -57,6 +60,7 @@ class Agent:
     rows: Rows | None = None
     offline_rows: Rows | None = None
     rewrites: Mapping[NestedKey, NestedKey] = field(default_factory=dict)
+    policy_builder: PolicyBuilder | None = None
 
     def rows_of(self, data: TensorDictBase) -> TensorDictBase:
         """Returns what of collected data goes to the replay buffer."""

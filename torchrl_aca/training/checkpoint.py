@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,9 +11,11 @@ import torch
 
 from torchrl_aca.errors import RunError
 from torchrl_aca.training.agent import Stateful
-from torchrl_aca.training.files import replace_file
+from torchrl_aca.training.files import read_torch_file, replace_file
+from torchrl_aca.training.policy import policy_path
 
 FORMAT = "torchrl-aca run 2"
+ENTRIES = {"config": dict, "parts": dict, "parts.counters": dict}
 
 
 @dataclass
@@ -56,6 +57,8 @@ def save_checkpoint(
 ) -> Path:
     """Writes `checkpoint_<updates>.pt` and removes all but the newest `keep_last` ones.
 
+    The policies beside the old ones go with them.
+
     A crash while it is written leaves the earlier checkpoints as they are.
     """
     directory.mkdir(parents=True, exist_ok=True)
@@ -63,6 +66,7 @@ def save_checkpoint(
     write_content(path, parts, config)
     for old in list_checkpoints(directory)[:-keep_last]:
         old.unlink()
+        policy_path(directory, updates_of(old)).unlink(missing_ok=True)
     return path
 
 
@@ -131,27 +135,7 @@ def _way_out(checkpoints: list[Path]) -> str:
 
 def read_content(path: Path) -> tuple[dict[str, Any], str]:
     """Returns a checkpoint's content, and what is wrong with it: nothing where it can be used."""
-    try:
-        with zipfile.ZipFile(path) as file:  # torch.save writes a checksum of every record
-            if (record := file.testzip()) is not None:
-                return {}, f"is damaged: the checksum of its {record!r} does not fit"
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # what unpickling raises depends on the foreign bytes
-        return {}, f"cannot be read as a checkpoint ({type(error).__name__}): damaged or foreign"
-    found = content.get("format") if isinstance(content, dict) else type(content).__name__
-    if found != FORMAT:
-        return {}, f"is no checkpoint of this version: expected {FORMAT!r}, got {found!r}"
-    for name, path_to in (
-        ("config", ("config",)),
-        ("parts", ("parts",)),
-        ("counters", ("parts", "counters")),
-    ):
-        value: Any = content
-        for key in path_to:
-            value = value.get(key)
-        if not isinstance(value, dict):
-            return {}, f"has no {name}: expected a dict, got {type(value).__name__}"
-    return content, ""
+    return read_torch_file(path, FORMAT, ENTRIES)
 
 
 def restore(parts: Mapping[str, Stateful], states: Mapping[str, Any]) -> None:

@@ -18,6 +18,8 @@ Seed = Annotated[int, Field(ge=0, lt=2**32 - 10**6)]  # of NumPy's range, with r
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
+Device = Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
+Threads = Annotated[int, Field(ge=1, le=4096)] | None
 Widths = Annotated[list[Annotated[int, Field(ge=1, le=10**5)]], Field(min_length=1)]
 
 
@@ -101,6 +103,7 @@ class Checkpoint(Section):
 
     interval: Count
     keep_last: Count
+    keep_best: bool = True  # runs from before it was a key resume
 
 
 class Logger(Section):
@@ -122,8 +125,8 @@ class RunConfig(Section):
     """What every training recipe has; a method adds its own section and its own `optim`."""
 
     seed: Seed
-    device: Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
-    num_threads: Annotated[int, Field(ge=1, le=4096)] | None
+    device: Device
+    num_threads: Threads
     compile: bool
     matmul_precision: Literal["highest", "high", "medium"]
     cudagraphs: bool

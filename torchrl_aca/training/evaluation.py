@@ -125,7 +125,8 @@ def record_video(
         raise RunError(
             f"the video could not be rendered with MUJOCO_GL={os.environ.get('MUJOCO_GL')!r}: "
             f"{error}. Try MUJOCO_GL=egl (needs libEGL) or MUJOCO_GL=osmesa (needs libOSMesa), and "
-            "pip install 'imageio[ffmpeg]'. The trained agent is safe in the checkpoints."
+            "pip install 'imageio[ffmpeg]'. The trained agent is safe in the checkpoints: "
+            "film it later with python recipes/evaluate.py run=RUN_DIR video=true."
         ) from error
 
 

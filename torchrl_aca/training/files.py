@@ -1,11 +1,14 @@
-"""Files that are replaced whole or not at all."""
+"""Files that are replaced whole or not at all, and checked when they are read."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+import zipfile
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
+
+import torch
 
 
 def replace_file(path: Path, write: Callable[[BinaryIO], object]) -> None:
@@ -24,3 +27,36 @@ def replace_file(path: Path, write: Callable[[BinaryIO], object]) -> None:
 def write_text(path: Path, text: str) -> None:
     """Replaces the text of a file, as `replace_file` does."""
     replace_file(path, lambda file: file.write(text.encode()))
+
+
+def read_torch_file(
+    path: Path, file_format: str, entries: Mapping[str, type]
+) -> tuple[dict[str, Any], str]:
+    """Reads what `torch.save` has written: tensors, numbers, texts and containers of them, no code.
+
+    Args:
+        path: The file.
+        file_format: What its entry "format" has to be.
+        entries: Other entries that it must have, and their types; "a.b" is b in a.
+
+    Returns:
+        The content, and what is wrong with it: nothing where it can be used.
+    """
+    try:
+        with zipfile.ZipFile(path) as file:  # torch.save writes a checksum of every record
+            if (record := file.testzip()) is not None:
+                return {}, f"is damaged: the checksum of its {record!r} does not fit"
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # what unpickling raises depends on the foreign bytes
+        return {}, f"cannot be read ({type(error).__name__}): damaged or foreign"
+    found = content.get("format") if isinstance(content, dict) else type(content).__name__
+    if found != file_format:
+        return {}, f"is not of this version: expected {file_format!r}, got {found!r}"
+    for name, kind in entries.items():
+        value: Any = content
+        for key in name.split("."):
+            value = value.get(key)
+        if not isinstance(value, kind):
+            last = name.rpartition(".")[2]
+            return {}, f"has no {last}: expected a {kind.__name__}, got {type(value).__name__}"
+    return content, ""

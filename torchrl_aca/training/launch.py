@@ -52,10 +52,24 @@ def make_device(cfg: Any) -> torch.device:
     Raises:
         RunError: If the device is not there.
     """
-    if cfg.num_threads is not None:
-        torch.set_num_threads(cfg.num_threads)
     torch.set_float32_matmul_precision(cfg.matmul_precision)
-    name = cfg.device
+    device = find_device(cfg.device, cfg.num_threads)
+    if cfg.cudagraphs and device.type != "cuda":
+        raise RunError(
+            f"cudagraphs=true: expected device=cuda, got {device}. Leave it out on a CPU; "
+            "compile=true works there."
+        )
+    return device
+
+
+def find_device(name: str, num_threads: int | None) -> torch.device:
+    """Sets the threads, where a number is given, and returns the device of that name.
+
+    Raises:
+        RunError: If the device is not there.
+    """
+    if num_threads is not None:
+        torch.set_num_threads(num_threads)
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
     try:
@@ -65,9 +79,4 @@ def make_device(cfg: Any) -> torch.device:
         raise RunError(f"device={name}: {message}. Use device=cpu or device=auto.") from error
     if device.type == "cuda":
         torch.cuda.set_device(device)
-    if cfg.cudagraphs and device.type != "cuda":
-        raise RunError(
-            f"cudagraphs=true: expected device=cuda, got {device}. Leave it out on a CPU; "
-            "compile=true works there."
-        )
     return device

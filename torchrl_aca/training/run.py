@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from omegaconf import OmegaConf
@@ -24,6 +25,7 @@ from torchrl_aca.training.collection import BadDataError, Collection
 from torchrl_aca.training.config import RunConfig
 from torchrl_aca.training.files import write_text
 from torchrl_aca.training.logging import MetricMeans, RunLogger
+from torchrl_aca.training.policy import best_return, policy_path, save_policy
 from torchrl_aca.training.pretrained import save_pretrained
 from torchrl_aca.training.progress import Pace, ProgressBar
 from torchrl_aca.training.randomness import RandomState
@@ -170,6 +172,7 @@ class Run:
         self.config = {**cfg.model_dump(), "resume": None}
         write_text(self.dir / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(self.config)))
         self._saved: tuple[int, int] | None = None  # the latest checkpoint of this session
+        self._best = best_return(self.dir / "checkpoints") if resumed else None
         self.logger = RunLogger(self.dir, self.config, self._axes() if resumed else None)
         total = cfg.optim.offline_updates + cfg.optim.total_updates
         self.bar = ProgressBar(total, counters.total)
@@ -284,6 +287,9 @@ class Run:
         self.logger.log("eval", self._axes(), self.counters.total, values)
         best = max(float(row["return_mean"]) for row in self.logger.tables["eval"].rows)
         self.bar.show_evaluation(self.counters.total, self.collection.frames, values, best)
+        if self.cfg.checkpoint.keep_best and is_better(values["return_mean"], self._best):
+            self._best = values["return_mean"]
+            self._save_policy("best", {**self._axes(), **values})
 
     def _speed(self) -> dict[str, float]:
         then, updates, frames = self._lap
@@ -300,7 +306,18 @@ class Run:
         """Writes a checkpoint of all parts."""
         self._saved = (self.counters.total, self.collection.frames)
         directory, keep_last = self.dir / "checkpoints", self.cfg.checkpoint.keep_last
-        return save_checkpoint(directory, self.parts, self.config, self.counters.total, keep_last)
+        updates = self.counters.total
+        self._save_policy(updates)  # first, so that no checkpoint is without one
+        return save_checkpoint(directory, self.parts, self.config, updates, keep_last)
+
+    def _save_policy(
+        self, which: int | Literal["best"], evaluation: Mapping[str, float] | None = None
+    ) -> None:
+        """Writes the policy for `load_policy`, if the agent tells how it is built."""
+        agent, path = self.agent, policy_path(self.dir / "checkpoints", which)
+        if agent.policy_builder is not None:
+            updates = self.counters.total
+            save_policy(path, agent.policy_builder, agent.policy, self.config, updates, evaluation)
 
     def __exit__(
         self,
@@ -372,6 +389,11 @@ def updates_due(cfg: RunConfig, frames: int) -> int:
 def passed(interval: int, since: int, now: int) -> bool:
     """Tells whether a multiple of `interval` lies in the updates after `since`, up to `now`."""
     return since // interval < now // interval
+
+
+def is_better(value: float, best: float | None) -> bool:
+    """Tells whether an evaluation is above the best one so far; the first one always is."""
+    return best is None or value > best or math.isnan(best)
 
 
 def has_reached(evaluations: Sequence[Mapping[str, Any]], stop_return: float | None) -> bool:

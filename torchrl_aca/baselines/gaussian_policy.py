@@ -1,0 +1,159 @@
+"""Gaussian policies of a small network: a tanh-squashed one, and a clipped one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.data import Bounded
+from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, TanhNormal
+
+__all__ = ["make_clipped_gaussian_policy", "make_gaussian_policy", "make_mlp"]
+
+
+class BoundedNormalParams(nn.Module):
+    """Splits (..., 2A) into a mean and a standard deviation whose logarithm is clamped."""
+
+    def __init__(self, log_std_min: float, log_std_max: float) -> None:
+        """Takes the bounds of the logarithm."""
+        super().__init__()
+        self.bounds = (log_std_min, log_std_max)
+
+    def forward(self, params: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns mean and standard deviation, (..., A) each."""
+        mean, log_std = params.chunk(2, dim=-1)
+        return mean, log_std.clamp(*self.bounds).exp()
+
+
+class FreeStd(nn.Module):
+    """Puts a mean in [-1, 1] into env units, beside a standard deviation that no state changes."""
+
+    centre: Tensor
+    half_range: Tensor
+
+    def __init__(self, action_spec: Bounded, log_std_min: float, log_std_max: float) -> None:
+        """Begins with a standard deviation of half the action's range."""
+        super().__init__()
+        low, high = action_spec.space.low, action_spec.space.high
+        self.bounds = (log_std_min, log_std_max)
+        self.register_buffer("centre", (low + high) / 2)
+        self.register_buffer("half_range", (high - low) / 2)
+        self.log_std = nn.Parameter(torch.zeros_like(low))
+
+    def forward(self, mean: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns mean and standard deviation, (..., A) each, in env units."""
+        std = self.half_range * self.log_std.clamp(*self.bounds).exp()
+        return self.centre + self.half_range * mean, std.expand_as(mean)
+
+
+def make_mlp(
+    num_in: int,
+    num_out: int,
+    *,
+    num_cells: Sequence[int] = (256, 256),
+    activation: str = "ReLU",
+    layer_norm: bool = False,
+    device: torch.device | str | None = None,
+) -> MLP:
+    """Builds TorchRL's MLP, with torch's own initialisation.
+
+    Args:
+        num_in: size of the input.
+        num_out: size of the output.
+
+    Keyword Args:
+        num_cells: widths of the hidden layers. Default: two of 256.
+        activation: name of an activation in ``torch.nn``. Default: ReLU.
+        layer_norm: normalise each hidden layer, with ``eps=1e-6``. Default: False.
+        device: device of the parameters.
+    """
+    norm: dict[str, Any] = {}
+    if layer_norm:
+        kwargs = [{"normalized_shape": cells, "eps": 1e-6} for cells in num_cells]
+        norm = {"norm_class": nn.LayerNorm, "norm_kwargs": kwargs}
+    kind = getattr(nn, activation)
+    return MLP(num_in, num_out, num_cells=num_cells, activation_class=kind, device=device, **norm)
+
+
+def make_gaussian_policy(
+    observation_dim: int,
+    spec: Bounded,
+    *,
+    log_std_min: float = -20.0,
+    log_std_max: float = 2.0,
+    device: torch.device | str | None = None,
+    **mlp: Any,
+) -> ProbabilisticActor:
+    """Builds the tanh-squashed Gaussian of SAC, whose network tells mean and standard deviation.
+
+    Args:
+        observation_dim: size ``O`` of the observation vector.
+        spec: bounded spec of one env's action, of shape ``(A,)``; the squash is to its bounds.
+
+    Keyword Args:
+        log_std_min: lower bound of the logarithm of the standard deviation. Default: -20.
+        log_std_max: upper bound. Default: 2.
+        device: device of the parameters.
+        mlp: keywords of :func:`make_mlp`.
+
+    Examples:
+        >>> from torchrl.data import Bounded
+        >>> from torchrl_aca.baselines import make_gaussian_policy
+        >>> policy = make_gaussian_policy(17, Bounded(-2.0, 2.0, shape=(6,)), num_cells=[64, 64])
+        >>> policy(TensorDict(observation=torch.zeros(3, 17), batch_size=[3]))["action"].shape
+        torch.Size([3, 6])
+    """
+    spec = spec.to(device)
+    network = nn.Sequential(
+        make_mlp(observation_dim, 2 * spec.shape[-1], device=device, **mlp),
+        BoundedNormalParams(log_std_min, log_std_max),
+    )
+    return ProbabilisticActor(
+        TensorDictModule(network, in_keys=["observation"], out_keys=["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        spec=spec,
+        distribution_class=TanhNormal,
+        distribution_kwargs={"low": spec.space.low, "high": spec.space.high},
+    )
+
+
+def make_clipped_gaussian_policy(
+    observation_dim: int,
+    spec: Bounded,
+    *,
+    log_std_min: float = -20.0,
+    log_std_max: float = 2.0,
+    device: torch.device | str | None = None,
+    **mlp: Any,
+) -> ProbabilisticActor:
+    """Builds the Gaussian of IQL, without a squash, whose actions are clipped to the bounds.
+
+    The network tells the mean, in units in which [-1, 1] is the action's range; the standard
+    deviation is the same in every state.
+
+    Args:
+        observation_dim: size ``O`` of the observation vector.
+        spec: bounded spec of one env's action, of shape ``(A,)``.
+
+    Keyword Args:
+        log_std_min: lower bound of the logarithm of the standard deviation, in the same units.
+            Default: -20.
+        log_std_max: upper bound. Default: 2.
+        device: device of the parameters.
+        mlp: keywords of :func:`make_mlp`.
+    """
+    spec = spec.to(device)
+    network = nn.Sequential(
+        make_mlp(observation_dim, spec.shape[-1], device=device, **mlp),
+        FreeStd(spec, log_std_min, log_std_max),
+    )
+    return ProbabilisticActor(
+        TensorDictModule(network, in_keys=["observation"], out_keys=["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        spec=spec,
+        safe=True,
+        distribution_class=IndependentNormal,
+    )
