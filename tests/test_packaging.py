@@ -80,6 +80,7 @@ OPTIONAL = [
     "omegaconf",
     "pydantic",
     "ray",
+    "scipy",
     "tensorboard",
     "tqdm",
     "wandb",

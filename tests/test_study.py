@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import time
 from pathlib import Path
 
 import pytest
+import yaml
 from hydra import initialize_config_dir
 
-from recipe_cases import CONFIGS, TINY, composed, rows_of, run, start
+from recipe_cases import CONFIGS, ROOT, TINY, composed, rows_of, run, start
 from studies.jobs import Job, StudyConfig, make_jobs
 from studies.status import State, left_seconds, state_of, summary
 from torchrl_aca.errors import RunError
@@ -136,3 +138,14 @@ def test_killed_and_bad_jobs_are_told_the_others_go_on_and_the_same_command_goes
     assert (two / "eval.csv").stat().st_mtime == evaluated
     updates = [int(row["updates"]) for row in rows_of(one / "eval.csv")]
     assert updates == [0, *range(30, 400, 30), 400]  # each once
+
+
+def test_the_page_has_every_key_with_its_default():
+    rows = dict(
+        re.findall(r"^\| `(\w+)` \| `(.+?)` \|", (ROOT / "docs/howto/study.md").read_text(), re.M)
+    )
+    config = yaml.safe_load((CONFIGS / "study.yaml").read_text())
+    chosen = {k: v for item in config["defaults"][1:] for k, v in item.items()}
+    expected = {**chosen, **config}
+    kept = [k for k in expected if k not in ("defaults", "hydra") and not k.startswith("override")]
+    assert {k: yaml.safe_load(v) for k, v in rows.items()} == {k: expected[k] for k in kept}
