@@ -21,6 +21,10 @@ def evaluate() -> None:
     _run("evaluate.py")
 
 
+def study() -> None:
+    _run("study.py")
+
+
 def make_dataset() -> None:
     _run("make_dataset.py")
 

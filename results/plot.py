@@ -85,6 +85,14 @@ class Curve:
         return [u for u in self.runs[0].column("updates") if len(self.at(u)) == len(self.runs)]
 
 
+def runs_in(folder: Path) -> list[Path]:
+    """A run directory, or all those below a folder."""
+    found = sorted(path.parent for path in folder.rglob("eval.csv"))
+    if not found:
+        raise SystemExit(f"error: {folder} holds no run: expected config.yaml and eval.csv.")
+    return found
+
+
 def make_curves(run_dirs: Sequence[Path]) -> list[Curve]:
     """The curves of run directories, in the order in which they are first named."""
     runs = [Run.read(run_dir) for run_dir in run_dirs]
@@ -140,11 +148,11 @@ def main() -> None:
     """Parses the command line, writes the figure and prints the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("output", type=Path)
-    parser.add_argument("run_dirs", type=Path, nargs="+")
+    parser.add_argument("run_dirs", type=Path, nargs="+", help="or folders that hold them")
     parser.add_argument("--line", action="append", default=[], help="NAME=RETURN, drawn dashed")
     arguments = parser.parse_args()
 
-    curves = make_curves(arguments.run_dirs)
+    curves = make_curves([run for folder in arguments.run_dirs for run in runs_in(folder)])
     figure = Figure(figsize=(6.4, 4), layout="constrained")
     axes = figure.subplots()
     for curve, label in zip(curves, labels(curves), strict=True):

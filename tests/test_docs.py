@@ -31,7 +31,7 @@ DOCS = ROOT / "docs"
 CONFIGS = ROOT / "recipes" / "configs"
 PAGES = [ROOT / "README.md", *(p for p in sorted(DOCS.rglob("*.md")) if "_build" not in p.parts)]
 BLOCK = re.compile(r"(?:<!-- needs: (\S+) -->\n)?^```python(.*)\n((?:.*\n)*?)^```$", re.MULTILINE)
-RECIPES = "online_mujoco|o2o_halfcheetah|evaluate|make_dataset|import_dataset"
+RECIPES = "online_mujoco|o2o_halfcheetah|evaluate|make_dataset|import_dataset|study"
 COMMAND = re.compile(rf"python recipes/({RECIPES})\.py((?:\\\n|[^\n`#])*)")
 
 

@@ -223,6 +223,7 @@ def test_a_run_that_was_killed_after_its_last_evaluation_goes_on(folder, tmp_pat
     generate("medium_replay", tmp_path, sac=[*SAC, "optim.total_updates=60"])
     (newest,) = (tmp_path / "sac" / "checkpoints").glob("*0060.pt")
     newest.unlink()  # the table still says that 60 updates were made
+    (tmp_path / "sac" / "done").unlink()
     (old,) = (folder / "sac" / "checkpoints").iterdir()
     shutil.copy(old, newest.parent)
     again = generate("medium", tmp_path, sac=[*SAC, "optim.total_updates=60"])

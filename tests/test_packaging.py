@@ -86,6 +86,7 @@ OPTIONAL = [
     "omegaconf",
     "pydantic",
     "ray",
+    "scipy",
     "tensorboard",
     "tqdm",
     "wandb",

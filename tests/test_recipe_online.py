@@ -35,6 +35,7 @@ from torchrl_aca.training.checkpoint import list_checkpoints
 from torchrl_aca.training.envs import make_env
 from torchrl_aca.training.resume import resumed_config
 from torchrl_aca.training.run import updates_due
+from torchrl_aca.training.signals import STOPPED
 
 SCRIPT = RECIPES / "online_mujoco.py"
 TINY_SAC = TINY["sac"]
@@ -55,6 +56,7 @@ def test_run_directory(unbroken):
     assert re.fullmatch(r"Hopper-v4-sac-s0-\d{8}-\d{6}", unbroken.name)
     assert names == {
         ".lock",
+        "done",
         "config.yaml",
         "versions.json",
         "metrics.csv",
@@ -118,8 +120,9 @@ def test_ctrl_c_leaves_a_checkpoint_that_resumes(unbroken, tmp_path):
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)
     output, errors = process.communicate(timeout=60)
-    assert process.returncode == 0, errors
+    assert process.returncode == STOPPED, errors
     assert "Traceback" not in errors
+    assert not (tmp_path / "here" / "done").exists()
     stopped = int(re.search(r"stopped by SIGINT after (\d+) updates", output)[1])
     assert f"python {SCRIPT} resume=here" in output
     assert OmegaConf.load(tmp_path / "here" / "config.yaml").optim.total_updates == 100000

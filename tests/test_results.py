@@ -95,6 +95,14 @@ def test_command_writes_the_figure_and_prints_the_table(tmp_path):
     assert "<!-- mean of the data -->" in figure.read_text()
 
 
+def test_a_folder_stands_for_the_runs_in_it_and_one_without_is_told(plot, tmp_path):
+    runs = [write_run(tmp_path / f"{s}", {0: 1.0, 10: 2.0}, seed=s) for s in (0, 1)]
+    assert plot.runs_in(tmp_path) == runs and plot.runs_in(runs[0]) == runs[:1]
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(SystemExit, match="empty holds no run"):
+        plot.runs_in(tmp_path / "empty")
+
+
 def test_the_readme_has_tables_that_a_command_prints():
     assert len(PLOTS) == 2
 

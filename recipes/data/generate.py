@@ -13,13 +13,14 @@ from omegaconf import OmegaConf
 from pydantic import Field
 
 from data.episodes import Episode, replayed, rollouts, sampled_actions, uniform_actions
-from data.sac_run import evaluations, finished_sac_run
+from data.sac_run import finished_sac_run
 from torchrl_aca.errors import DatasetError
 from torchrl_aca.offline import DatasetWriter, OfflineDataset, reference_scores
 from torchrl_aca.offline.registry import ROOT
 from torchrl_aca.training.config import Count, Section, Seed
 from torchrl_aca.training.envs import make_env, task_name
 from torchrl_aca.training.report import plot_returns, versions
+from torchrl_aca.training.resume import read_evaluations
 
 Tier = Literal["random", "medium", "medium_replay"]
 Statistic = Literal["mean", "std", "min", "max"]
@@ -126,6 +127,6 @@ def provenance(cfg: GeneratorConfig, source: Path | None) -> dict[str, Any]:
     if source is not None:
         facts["sac"] = {
             "config": OmegaConf.to_container(OmegaConf.load(source / "config.yaml")),
-            "evaluations": evaluations(source),
+            "evaluations": read_evaluations(source),
         }
     return facts

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,10 +13,9 @@ from omegaconf import DictConfig
 
 from agents import AGENTS, without_methods
 from torchrl_aca.errors import RunError
-from torchrl_aca.training.checkpoint import list_checkpoints, updates_of
-from torchrl_aca.training.resume import apply_overrides, read_config, require_equal
-from torchrl_aca.training.run import has_reached
-from torchrl_aca.training.signals import StopSignal
+from torchrl_aca.training.checkpoint import list_checkpoints
+from torchrl_aca.training.resume import apply_overrides, is_finished, read_config, require_equal
+from torchrl_aca.training.signals import STOPPED, StopSignal, run_command
 
 SCRIPT = Path(__file__).parents[1] / "online_mujoco.py"
 ENDS = ("eval.stop_return", "optim.total_updates")  # where the run ends is this command's say
@@ -66,44 +63,6 @@ def _selected(cfg: DictConfig, key: str) -> Any:
 def _run(*arguments: str) -> None:
     """Runs `online_mujoco.py`; a signal is passed on, so that the run leaves a checkpoint."""
     with StopSignal() as stop:
-        # A session of its own: Ctrl-C reaches it once, through this process.
-        process = subprocess.Popen(
-            [sys.executable, str(SCRIPT), *arguments], start_new_session=True
-        )
-        try:
-            told = False
-            while process.poll() is None:
-                if stop.received and not told:
-                    process.terminate()
-                    told = True
-                try:
-                    process.wait(timeout=0.2)
-                except subprocess.TimeoutExpired:
-                    continue
-        finally:
-            if process.poll() is None:
-                process.kill()
-    if code := process.returncode:
+        code = run_command([sys.executable, str(SCRIPT), *arguments], stop)
+    if code not in (0, STOPPED):
         raise RunError(f"the SAC run ended with status {code}; see its message above.")
-
-
-def is_finished(run_dir: Path, cfg: DictConfig) -> bool:
-    """Whether a run has made all its updates, or stopped at the return it was to reach."""
-    history = evaluations(run_dir)
-    checkpoints = list_checkpoints(run_dir / "checkpoints")
-    if not history or not checkpoints:
-        return False
-    updates = history[-1]["updates"]
-    # A run that was killed between its last evaluation and its last checkpoint still has to go on.
-    saved = updates_of(checkpoints[-1]) == updates
-    enough = updates >= cfg.optim.total_updates or has_reached(history, cfg.eval.stop_return)
-    return saved and enough
-
-
-def evaluations(run_dir: Path) -> list[dict[str, float]]:
-    """The rows of a run's eval.csv; none where it has not evaluated yet."""
-    path = run_dir / "eval.csv"
-    if not path.is_file():
-        return []
-    with open(path, newline="") as file:
-        return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]

@@ -131,6 +131,7 @@ class RunConfig(Section):
     matmul_precision: Literal["highest", "high", "medium"]
     cudagraphs: bool
     run_dir: str | None
+    existing: Literal["fail", "resume"] = "fail"  # checkpoints of before have no such key
     resume: str | None
     env: Env
     algo: Algo

@@ -3,44 +3,76 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Any
 
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from torchrl_aca.errors import DatasetError, RunError
-from torchrl_aca.training.resume import resumed_config
+from torchrl_aca.training.checkpoint import list_checkpoints, read_checkpoint
+from torchrl_aca.training.resume import (
+    continued_config,
+    is_finished,
+    read_config,
+    resumed_config,
+)
+from torchrl_aca.training.run_dir import DONE
+from torchrl_aca.training.signals import STOPPED
 
-Train = Callable[[DictConfig, "dict[str, Any] | None"], object]
+Train = Callable[[DictConfig, "dict[str, Any] | None"], Path]
 
 
 def launch(train: Train, cfg: DictConfig) -> None:
-    """Starts a run, or goes on with the one in `cfg.resume`.
+    """Starts a run, or goes on with the one in `cfg.resume`, or in `cfg.run_dir` where it may.
 
     Args:
-        train: Takes a configuration, and the checkpoint to go on from or None.
+        train: Takes a configuration, and the checkpoint to go on from or None; returns the run's
+            directory.
         cfg: What Hydra has composed. A job of `--multirun` has the directory that Hydra named after
             its overrides.
 
     Raises:
-        SystemExit: With one message, if the user can mend what is wrong.
+        SystemExit: With one message, if the user can mend what is wrong; with status 143 after a
+            run that was told to stop.
+        RunError, DatasetError: The same mistakes in a job of `--multirun`, whose others go on.
     """
     hydra = HydraConfig.get()
+    is_job = hydra.mode is RunMode.MULTIRUN
     try:
-        if hydra.mode is RunMode.MULTIRUN and cfg.run_dir is None:
+        if is_job and cfg.run_dir is None:
             cfg.run_dir = hydra.runtime.output_dir
-        if cfg.resume is None:
-            train(cfg, None)
-        else:
-            train(*resumed_config(cfg, hydra.overrides.task))
+        run_dir = _trained(train, cfg, hydra.overrides.task)
     except (DatasetError, RunError) as error:
+        if is_job:  # Hydra raises it after the last job, and that of the first one alone
+            print(f"error: {error}", file=sys.stderr)
+            raise
         raise SystemExit(f"error: {error}") from None
     except KeyboardInterrupt:
         print("stopped before the run began: nothing is lost", file=sys.stderr)
         raise SystemExit(130) from None
+    if not (run_dir / DONE).exists():
+        raise SystemExit(STOPPED)
+
+
+def _trained(train: Train, cfg: DictConfig, overrides: Iterable[str]) -> Path:
+    """Trains from where the run is, unless it is finished, and returns its directory."""
+    if cfg.resume is not None:
+        return train(*resumed_config(cfg, overrides))
+    if cfg.existing != "resume" or cfg.run_dir is None:
+        return train(cfg, None)
+    run_dir = Path(cfg.run_dir)
+    done, stored = (run_dir / DONE).exists(), read_config(run_dir)
+    if done and stored is not None and is_finished(run_dir, continued_config(cfg, stored)):
+        print(f"{run_dir} is finished: nothing to do", flush=True)
+        return run_dir
+    if not done and not list_checkpoints(run_dir / "checkpoints"):
+        return train(cfg, None)
+    checkpoint = read_checkpoint(run_dir)
+    return train(continued_config(cfg, OmegaConf.create(checkpoint["config"])), checkpoint)
 
 
 def make_device(cfg: Any) -> torch.device:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_aca.errors import RunError
 from torchrl_aca.training.checkpoint import read_checkpoint
+from torchrl_aca.training.run import has_reached
+from torchrl_aca.training.run_dir import DONE
 
 MAY_CHANGE_ON_RESUME = (
     "optim.total_updates",
@@ -19,7 +22,7 @@ MAY_CHANGE_ON_RESUME = (
     "video",
     "eval.stop_return",
 )
-NOT_COMPARED = (*MAY_CHANGE_ON_RESUME, "resume", "run_dir")
+NOT_COMPARED = (*MAY_CHANGE_ON_RESUME, "resume", "run_dir", "existing")
 
 
 def resumed_config(cfg: DictConfig, overrides: Iterable[str]) -> tuple[DictConfig, dict[str, Any]]:
@@ -46,6 +49,51 @@ def resumed_config(cfg: DictConfig, overrides: Iterable[str]) -> tuple[DictConfi
     apply_overrides(run, cfg, overrides)
     run.resume = str(run_dir)
     return run, checkpoint
+
+
+def continued_config(cfg: DictConfig, stored: DictConfig) -> DictConfig:
+    """Returns the configuration with which the command of a new run goes on with an old one.
+
+    All of the command's settings are compared, typed or not.
+
+    Args:
+        cfg: The configuration that was composed for this call.
+        stored: That of the run in `cfg.run_dir`.
+
+    Raises:
+        RunError: If the run is another one.
+    """
+    run = stored.copy()
+    require_equal(cfg, run, run, f"the command for run_dir={cfg.run_dir}")
+    for key in MAY_CHANGE_ON_RESUME:
+        value = OmegaConf.select(cfg, key)
+        if key != "optim.total_updates" or value is not None:  # null follows from what is compared
+            OmegaConf.update(run, key, value)
+    run.resume = cfg.run_dir
+    return run
+
+
+def is_finished(run_dir: Path, cfg: Any) -> bool:
+    """Tells whether the run in a directory has ended by itself, where `cfg` has its end or later.
+
+    Args:
+        run_dir: The run's directory; it may be missing.
+        cfg: A configuration with `optim.total_updates` and `eval.stop_return`.
+    """
+    if not (run_dir / DONE).exists():
+        return False
+    rows = read_evaluations(run_dir)
+    updates = rows[-1]["updates"]
+    return updates >= cfg.optim.total_updates or has_reached(rows, cfg.eval.stop_return)
+
+
+def read_evaluations(run_dir: Path) -> list[dict[str, float]]:
+    """Returns the rows of a run's eval.csv; none where it has not evaluated yet."""
+    path = run_dir / "eval.csv"
+    if not path.is_file():
+        return []
+    with open(path, newline="") as file:
+        return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
 
 
 def read_config(run_dir: Path) -> DictConfig | None:

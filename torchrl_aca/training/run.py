@@ -30,7 +30,7 @@ from torchrl_aca.training.pretrained import save_pretrained
 from torchrl_aca.training.progress import Pace, ProgressBar
 from torchrl_aca.training.randomness import RandomState
 from torchrl_aca.training.report import plot_curve, versions, write_card
-from torchrl_aca.training.run_dir import lock, make_run_dir, require_newest
+from torchrl_aca.training.run_dir import DONE, lock, make_run_dir, require_newest
 from torchrl_aca.training.signals import StopSignal
 
 Metrics = Mapping[str, float]
@@ -164,6 +164,7 @@ class Run:
     def _open(self, resumed: bool, notes: Sequence[str]) -> None:
         """Writes what describes the run, and opens its log."""
         counters, cfg = self.counters, self.cfg
+        (self.dir / DONE).unlink(missing_ok=True)
         if resumed:
             require_newest(self.dir, counters.total)
         else:
@@ -351,6 +352,7 @@ class Run:
         write_card(self.dir, self.config, rows, self.counters.seconds, self.facts)
         plot_curve(self.dir, title, rows)
         if self.completed:
+            write_text(self.dir / DONE, f"{self.counters.updates}\n")
             before, after = (float(row["return_mean"]) for row in (rows[0], rows[-1]))
             self.bar.write(f"mean evaluation return: before {before:.1f}, after {after:.1f}")
         else:

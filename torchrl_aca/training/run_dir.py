@@ -10,6 +10,8 @@ from filelock import FileLock, Timeout
 from torchrl_aca.errors import RunError
 from torchrl_aca.training.checkpoint import list_checkpoints, updates_of
 
+DONE = "done"  # a file in the directory of a run that has ended by itself: its updates
+
 
 def make_run_dir(run_dir: str | None, name: str) -> Path:
     """Creates the directory of a new run.
@@ -28,7 +30,7 @@ def make_run_dir(run_dir: str | None, name: str) -> Path:
     if list_checkpoints(path / "checkpoints"):
         raise RunError(
             f"run_dir={run_dir} already holds a run; expected a new directory. Give another "
-            f"run_dir, or go on with resume={run_dir}."
+            f"run_dir, or go on with resume={run_dir} or existing=resume."
         )
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -68,6 +70,17 @@ def lock(run_dir: Path) -> FileLock:
             "Ctrl-C first: it leaves a checkpoint."
         ) from None
     return found
+
+
+def is_locked(run_dir: Path) -> bool:
+    """Whether a process, on this machine or another one of a shared disk, is at work on a run."""
+    if not (run_dir / ".lock").exists():
+        return False
+    try:
+        lock(run_dir).release()
+    except RunError:
+        return True
+    return False
 
 
 def require_newest(run_dir: Path, updates: int) -> None:

@@ -1,10 +1,14 @@
-"""Ctrl-C and SIGTERM."""
+"""Ctrl-C and SIGTERM, in a run and in what starts runs."""
 
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable
+import subprocess
+from collections.abc import Callable, Sequence
 from types import FrameType
+from typing import Any
+
+STOPPED = 143  # exit status of a run that was told to stop; that of a shell for SIGTERM
 
 
 class StopSignal:
@@ -42,3 +46,31 @@ class StopSignal:
         for each, handler in self._previous.items():
             signal.signal(each, handler)
         self._say(f"{self.received}: stopping after this {self.activity}; Ctrl-C again quits")
+
+
+def run_command(command: Sequence[str], stop: StopSignal, **options: Any) -> int:
+    """Runs a command to its end, and tells it once if it is to stop.
+
+    Args:
+        command: A program and its arguments.
+        stop: The wish to stop; the program gets it as SIGTERM.
+        options: For `subprocess.Popen`.
+
+    Returns:
+        The exit status; that of a program which a signal has killed is negative.
+    """
+    # A session of its own: Ctrl-C reaches it once, through this process.
+    process = subprocess.Popen(command, start_new_session=True, **options)
+    told = False
+    try:
+        while True:
+            if stop.received and not told:
+                process.terminate()
+                told = True
+            try:
+                return process.wait(timeout=0.2)
+            except subprocess.TimeoutExpired:
+                continue
+    except BaseException:
+        process.terminate()  # the first one lets it save, a second one ends it at once
+        raise

@@ -1,0 +1,149 @@
+"""The jobs of a study: every task with every method and seed, each in a directory of its own."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import hydra
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+from pydantic import Field
+
+from agents import configured
+from torchrl_aca.errors import RunError
+from torchrl_aca.training.config import Count, RunConfig, Section, Seed
+
+SCRIPT = Path(__file__).parents[1] / "online_mujoco.py"
+
+Name = Annotated[str, Field(pattern=r"^[\w.+-]+$")]  # a part of a directory's name
+Overrides = dict[Name, list[str]]
+
+
+class Study(Section):
+    """`configs/study/<name>.yaml`; lists hold what one would type behind `online_mujoco.py`."""
+
+    name: Name
+    config: str
+    tasks: Annotated[Overrides, Field(min_length=1)]
+    methods: Annotated[Overrides, Field(min_length=1)]
+    seeds: Annotated[list[Seed], Field(min_length=1)]
+    settings: list[str]
+
+
+class Local(Section):
+    """`configs/launcher/local.yaml`."""
+
+    name: Literal["local"]
+    jobs: Count | None
+
+
+class Submitit(Section):
+    """`configs/launcher/submitit.yaml`."""
+
+    name: Literal["submitit"]
+    cluster: Literal["slurm", "local"]
+    timeout_min: Count
+    parameters: dict[str, Any]
+
+
+class Ray(Section):
+    """`configs/launcher/ray.yaml`."""
+
+    name: Literal["ray"]
+    address: str | None
+    retries: Annotated[int, Field(ge=0)]
+
+
+class StudyConfig(Section):
+    """`configs/study.yaml`."""
+
+    study: Study
+    launcher: Annotated[Local | Submitit | Ray, Field(discriminator="name")]
+    dir: str | None
+    threads: Annotated[int, Field(ge=1, le=4096)]
+    status: bool
+
+
+@dataclass(frozen=True)
+class Job:
+    """A run of a study.
+
+    Attributes:
+        method: The study's name of it.
+        dir: The run directory, named by task, method and seed.
+        config: The configuration, which has where the run ends.
+        overrides: What the command says.
+    """
+
+    method: str
+    dir: Path
+    config: RunConfig
+    overrides: tuple[str, ...]
+
+    @property
+    def command(self) -> list[str]:
+        """What one would type: typed again, it goes on with the run."""
+        return [sys.executable, str(SCRIPT), *self.overrides]
+
+    @property
+    def output(self) -> Path:
+        """Where the command's output goes."""
+        return self.dir / "output.txt"
+
+
+def study_dir(cfg: StudyConfig) -> Path:
+    """The directory of a study."""
+    return Path(cfg.dir or f"runs/studies/{cfg.study.name}").resolve()
+
+
+def make_jobs(cfg: StudyConfig) -> list[Job]:
+    """The jobs, all seeds of one task and method before the next.
+
+    Raises:
+        RunError: If a setting of any of them is wrong.
+    """
+    return [
+        job
+        for task in cfg.study.tasks
+        for method in cfg.study.methods
+        for job in _jobs_of(cfg, task, method)
+    ]
+
+
+def _jobs_of(cfg: StudyConfig, task: str, method: str) -> Iterator[Job]:
+    study = cfg.study
+    chosen = [*study.tasks[task], *study.methods[method], *study.settings]
+    try:
+        composed = hydra.compose(study.config, [*chosen, f"num_threads={cfg.threads}"])
+        config = configured(composed)
+    except (HydraException, RunError) as error:
+        raise RunError(f"study={study.name}, {method} on {task}: {error}") from None
+    for seed in study.seeds:
+        run_dir = study_dir(cfg) / f"{task}-{method}-s{seed}"
+        overrides = (
+            "--config-name",
+            study.config,
+            *chosen,
+            f"num_threads={cfg.threads}",
+            f"seed={seed}",
+            f"run_dir={run_dir}",
+            "existing=resume",
+        )
+        yield Job(method, run_dir, config, overrides)
+
+
+def write_study(cfg: StudyConfig) -> None:
+    """Keeps what the study is in its directory.
+
+    Raises:
+        RunError: If the directory is that of another study.
+    """
+    path = study_dir(cfg) / "study.yaml"
+    if path.exists() and (found := OmegaConf.load(path).name) != cfg.study.name:
+        raise RunError(f"dir={path.parent} holds the study {found}; expected a new directory.")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    OmegaConf.save(OmegaConf.create(cfg.study.model_dump()), path)

@@ -1,0 +1,103 @@
+"""How far the jobs of a study are: read from their directories, so at any time and by anybody."""
+
+from __future__ import annotations
+
+import csv
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import timedelta
+from statistics import fmean
+
+from studies.jobs import Job
+from torchrl_aca.training.resume import is_finished, read_evaluations
+from torchrl_aca.training.run_dir import is_locked
+
+
+@dataclass(frozen=True)
+class State:
+    """Where a job is.
+
+    Attributes:
+        name: "done", "running", "stopped" (told to stop, killed or failed) or "left" (not begun).
+        updates: Made, as far as its table has them.
+        seconds: What they took; 0 where nothing is known.
+        latest: The latest evaluation return, or None.
+    """
+
+    name: str
+    updates: int
+    seconds: float
+    latest: float | None
+
+
+def state_of(job: Job) -> State:
+    """Reads a job's directory."""
+    updates, seconds = _progress(job)
+    returns = [row["return_mean"] for row in read_evaluations(job.dir)]
+    if is_finished(job.dir, job.config):
+        name, updates = "done", job.config.optim.total_updates
+    elif is_locked(job.dir):
+        name = "running"
+    else:
+        name = "stopped" if job.dir.exists() else "left"
+    return State(name, updates, seconds, returns[-1] if returns else None)
+
+
+def _progress(job: Job) -> tuple[int, float]:
+    """Updates and seconds of the last row of a job's metrics.csv."""
+    path = job.dir / "metrics.csv"
+    if not path.is_file():
+        return 0, 0.0
+    with open(path, newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row.get("updates_per_second")]  # whole rows
+    return (int(rows[-1]["updates"]), float(rows[-1]["seconds"])) if rows else (0, 0.0)
+
+
+def last_line(job: Job) -> str:
+    """The last line of a job's output: why it stopped."""
+    lines = job.output.read_text().splitlines() if job.output.exists() else []
+    return next((line for line in reversed(lines) if line.strip()), "")
+
+
+def status_table(jobs: Sequence[Job]) -> str:
+    """A line for each job, and a summary."""
+    states = [state_of(job) for job in jobs]
+    width = max(len(job.dir.name) for job in jobs)
+    lines = []
+    for job, state in zip(jobs, states, strict=True):
+        made = f"{state.updates:,}/{job.config.optim.total_updates:,}"
+        value = "" if state.latest is None else f"return {state.latest:.1f}"
+        why = last_line(job) if state.name == "stopped" else ""
+        lines.append(
+            f"{job.dir.name:<{width}}  {state.name:<8}{made:>20}  {value:<16}{why}".rstrip()
+        )
+    return "\n".join([*lines, summary(jobs, states)])
+
+
+def summary(jobs: Sequence[Job], states: Sequence[State]) -> str:
+    """How many jobs are where, and how long what is left would take one after the other."""
+    counts = Counter(state.name for state in states)
+    numbers = ", ".join(f"{counts[name]} {name}" for name in ("done", "running", "stopped", "left"))
+    seconds = left_seconds(jobs, states)
+    if seconds is None:
+        return f"{numbers}; the time of a method without updates so far is unknown"
+    left = f"{numbers}; work left: {timedelta(seconds=round(seconds))}"
+    if not (at_once := counts["running"]):
+        return left
+    return f"{left}; {timedelta(seconds=round(seconds / at_once))} at {at_once} at once"
+
+
+def left_seconds(jobs: Sequence[Job], states: Sequence[State]) -> float | None:
+    """The work left at the speed of each method so far; None if one with work left has none."""
+    paces: dict[str, list[float]] = {}
+    for job, state in zip(jobs, states, strict=True):
+        if state.updates and state.seconds:
+            paces.setdefault(job.method, []).append(state.seconds / state.updates)
+    total = 0.0
+    for job, state in zip(jobs, states, strict=True):
+        updates = job.config.optim.total_updates - state.updates
+        if updates and job.method not in paces:
+            return None
+        total += updates * fmean(paces.get(job.method, [0.0]))
+    return total

@@ -1,0 +1,53 @@
+"""Promises of `existing=resume`: the same command again goes on, or has nothing to do."""
+
+from __future__ import annotations
+
+import time
+
+from recipe_cases import TINY, assert_same_state, rows_of, run, start, without_time
+
+HERE = [*TINY["sac"], "run_dir=here", "existing=resume"]
+
+
+def test_the_same_command_goes_on_after_a_kill_and_then_has_nothing_to_do(tmp_path):
+    other = tmp_path / "other"
+    other.mkdir()
+    code, _, errors = run(*HERE, cwd=other)
+    assert code == 0, errors
+
+    process = start(*HERE, "checkpoint.interval=1", cwd=tmp_path)
+    deadline = time.time() + 60
+    while not list((tmp_path / "here" / "checkpoints").glob("*.pt")) and time.time() < deadline:
+        time.sleep(0.02)
+    process.kill()
+    process.communicate()
+    assert not (tmp_path / "here" / "done").exists()
+    code, output, errors = run(*HERE, cwd=tmp_path)
+    assert code == 0, errors
+    assert_same_state(other / "here", tmp_path / "here")
+    assert without_time(other / "here" / "eval.csv") == without_time(tmp_path / "here" / "eval.csv")
+
+    code, output, errors = run(*HERE, cwd=tmp_path)
+    assert (code, errors, output) == (0, "", "here is finished: nothing to do\n")
+    for path in (tmp_path / "here" / "checkpoints").iterdir():
+        path.unlink()  # room on the disk: a finished run is not begun anew for that
+    assert run(*HERE, cwd=tmp_path)[1] == output
+
+
+def test_another_command_does_not_go_on_and_a_longer_one_does(tmp_path):
+    assert run(*HERE, cwd=tmp_path)[0] == 0
+    code, _, errors = run(*HERE[:-1], cwd=tmp_path)
+    assert code == 1 and "go on with resume=here or existing=resume" in errors
+    code, _, errors = run(*HERE, "optim.gamma=0.9", cwd=tmp_path)
+    assert code == 1 and "run_dir=here has optim.gamma=0.9, but the run to resume has" in errors
+    code, _, errors = run(*HERE, "optim.total_updates=65", cwd=tmp_path)
+    assert code == 0, errors
+    assert rows_of(tmp_path / "here" / "eval.csv")[-1]["updates"] == "65"
+    assert (tmp_path / "here" / "done").read_text() == "65\n"
+
+
+def test_a_job_of_a_sweep_that_fails_is_told_and_the_others_go_on(tmp_path):
+    jobs = ["optim.gamma=0.9,7,0.8", "hydra.sweep.dir=jobs", "hydra.sweep.subdir=${optim.gamma}"]
+    code, _, errors = run("--multirun", *TINY["sac"], *jobs, cwd=tmp_path)
+    assert code == 1 and "error: optim.gamma=7: expected less than or equal to 1" in errors
+    assert [path.parent.name for path in sorted(tmp_path.glob("jobs/*/done"))] == ["0.8", "0.9"]

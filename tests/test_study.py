@@ -1,0 +1,151 @@
+"""Promises of `recipes/study.py`: what runs, what is left alone, what is told."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+from hydra import initialize_config_dir
+
+from recipe_cases import CONFIGS, ROOT, TINY, composed, rows_of, run, start
+from studies.jobs import Job, StudyConfig, make_jobs
+from studies.status import State, left_seconds, state_of, summary
+from torchrl_aca.errors import RunError
+from torchrl_aca.training.config import checked
+from torchrl_aca.training.run_dir import lock
+
+
+@pytest.fixture
+def study():
+    """Makes the jobs of a study as `study.py` does, inside Hydra."""
+
+    def jobs(*overrides: str) -> list[Job]:
+        cfg = checked(StudyConfig, composed(*overrides, name="study"))
+        with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+            return make_jobs(cfg)
+
+    return jobs
+
+
+def test_jobs_are_named_by_task_method_and_seed_and_are_commands(study):
+    jobs = study("study=tiny", "dir=/s")
+    names = [f"InvertedPendulum-v4-{m}-s{s}" for m in ("aca", "sac") for s in (0, 1)]
+    assert [job.dir.name for job in jobs] == names
+    typed = ["env=inverted_pendulum", "algo=sac", "seed=1", f"run_dir=/s/{names[3]}"]
+    assert {*typed, "existing=resume", "num_threads=1"} < set(jobs[3].command)
+    assert jobs[3].config.optim.total_updates == 3000
+
+
+def test_every_study_of_the_package_is_a_valid_one(study):
+    assert len(study("study=table2")) == 6 * 7 * 5
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("study.settings=['optim.lr=0']", "aca on InvertedPendulum-v4: optim.lr=0.*expected"),
+        ("study.settings=['optim.lrr=1']", "aca on InvertedPendulum-v4: .*lrr"),
+        ("study.name=a/b", "study.name='a/b': expected"),
+        ("study.seeds=[]", r"study.seeds=\[\]: expected"),
+        ("launcher.jobs=0", "launcher.local.jobs=0: expected greater than"),
+    ],
+)
+def test_a_mistake_in_any_job_is_told_before_the_first_one_starts(study, override, message):
+    with pytest.raises(RunError, match=message):
+        study("study=tiny", override)
+
+
+def write_progress(run_dir: Path, updates: int, seconds: float, done: bool = False) -> None:
+    run_dir.mkdir(parents=True)
+    (run_dir / "metrics.csv").write_text(
+        f"updates,seconds,updates_per_second\n{updates},{seconds},1\n"
+    )
+    (run_dir / "eval.csv").write_text(f"updates,return_mean\n{updates},7.5\n")
+    if done:
+        (run_dir / "done").write_text(f"{updates}\n")
+
+
+def test_states_and_expected_time_are_read_from_the_directories(study, tmp_path):
+    jobs = study("study=tiny", f"dir={tmp_path}")
+    assert [state_of(job) for job in jobs] == [State("left", 0, 0.0, None)] * 4
+    assert "is unknown" in summary(jobs, [state_of(job) for job in jobs])
+    write_progress(jobs[0].dir, 3000, 600.0, done=True)  # 0.2 s an update
+    write_progress(jobs[1].dir, 1000, 200.0)
+    write_progress(jobs[2].dir, 1000, 100.0)  # 0.1 s an update
+    held = lock(jobs[1].dir)
+    states = [state_of(job) for job in jobs]
+    held.release()
+    assert [state.name for state in states] == ["done", "running", "stopped", "left"]
+    assert states[0].latest == 7.5
+    # 2000 updates of the second job, 2000 of the third, 3000 of the fourth
+    assert left_seconds(jobs, states) == pytest.approx(2000 * 0.2 + 2000 * 0.1 + 3000 * 0.1)
+    text = "1 done, 1 running, 1 stopped, 1 left; work left: 0:15:00; 0:15:00 at 1 at once"
+    assert summary(jobs, states) == text
+
+
+def write_study(folder: Path) -> None:
+    methods = {name: [o for o in TINY["sac"] if o != "env=hopper"] for name in ("one", "two")}
+    methods["bad"] = ["algo=sac", "env.name=Nowhere-v0"]
+    text = f"""name: mine
+config: online_mujoco
+tasks: {{Reacher-v4: [env=reacher]}}
+methods: {methods}
+seeds: [0]
+settings: [checkpoint.interval=1, optim.total_updates=400]
+"""
+    (folder / "study").mkdir()
+    (folder / "study" / "mine.yaml").write_text(text)
+
+
+def pid_of(words: str) -> int | None:
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            if words in path.read_text():
+                return int(path.parent.name)
+        except OSError:
+            continue
+    return None
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/cmdline").exists(), reason="finds a job by /proc")
+def test_killed_and_bad_jobs_are_told_the_others_go_on_and_the_same_command_goes_on(tmp_path):
+    write_study(tmp_path)
+    command = ["--config-dir", str(tmp_path), "study=mine", "launcher.jobs=2"]
+    process = start(*command, cwd=tmp_path, recipe="study")
+    one, two, bad = (
+        tmp_path / f"runs/studies/mine/Reacher-v4-{m}-s0" for m in ("one", "two", "bad")
+    )
+    deadline = time.time() + 60
+    while not list(one.glob("checkpoints/*.pt")) and time.time() < deadline:
+        time.sleep(0.02)
+    os.kill(pid_of(f"run_dir={one}"), signal.SIGKILL)
+    output, errors = process.communicate(timeout=120)
+    assert process.returncode == 1 and "Traceback" not in errors
+    assert "Reacher-v4-one-s0 failed with status -9" in output
+    assert "Reacher-v4-two-s0 done" in output
+    assert "Reacher-v4-bad-s0 failed with status 1: error: env.name='Nowhere-v0'" in output
+    assert "1 done, 0 running, 2 stopped, 0 left" in output
+
+    evaluated = (two / "eval.csv").stat().st_mtime
+    _, output, _ = run(*command, cwd=tmp_path, recipe="study")
+    assert "2 of 3 jobs to do" in output and "Reacher-v4-one-s0 done" in output
+    assert (two / "eval.csv").stat().st_mtime == evaluated
+    updates = [int(row["updates"]) for row in rows_of(one / "eval.csv")]
+    assert updates == [0, *range(30, 400, 30), 400]  # each once
+
+
+def test_the_page_has_every_key_with_its_default():
+    rows = dict(
+        re.findall(r"^\| `(\w+)` \| `(.+?)` \|", (ROOT / "docs/howto/study.md").read_text(), re.M)
+    )
+    config = yaml.safe_load((CONFIGS / "study.yaml").read_text())
+    chosen = {k: v for item in config["defaults"][1:] for k, v in item.items()}
+    expected = {**chosen, **config}
+    kept = [k for k in expected if k not in ("defaults", "hydra") and not k.startswith("override")]
+    assert {k: yaml.safe_load(v) for k, v in rows.items()} == {k: expected[k] for k in kept}
