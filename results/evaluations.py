@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 from omegaconf import OmegaConf
 
+from curves import shared
+
 COLUMNS = [
     "method",
     "task",
@@ -84,15 +86,10 @@ def by_seed(rows: Sequence[Row], task: str, method: str) -> dict[float, dict[flo
     return seeds
 
 
-def shared_updates(runs: Sequence[dict[float, float]]) -> list[float]:
-    """The updates at which all of these runs were evaluated."""
-    return sorted(set.intersection(*(set(run) for run in runs))) if runs else []
-
-
 def compared_at(rows: Sequence[Row], task: str, updates: float | None) -> float:
     """The updates at which a task's methods are compared."""
     runs = [run for m in names(rows, "method") for run in by_seed(rows, task, m).values()]
-    return shared_updates(runs)[-1] if updates is None else updates
+    return shared(runs)[-1] if updates is None else updates
 
 
 def returns(rows: Sequence[Row], task: str, method: str, updates: float) -> np.ndarray:

@@ -1,12 +1,14 @@
 """Evaluation returns of several runs: one figure, and the same numbers as a table.
 
-    python results/plot.py results/quickstart/curve.png results/quickstart/seed* --line random=5
+    python results/plot.py results/quickstart/curve.png results/quickstart --line random=5
+    python results/plot.py OUT.png runs/mine --x frames
 
-Runs that differ in nothing but their seed are one curve: the mean over seeds, and each seed thin.
-A curve of a single run has a band of one standard deviation over episodes. Updates of an offline
-phase are below zero, so that the online phases of all runs begin at the same place. The table is
+Runs that differ in nothing but their seed are one curve: the mean over seeds with a 95 % bootstrap
+interval. A curve of a single run has a band of one standard deviation over episodes. Each task has
+a panel. Updates of an offline phase are below zero, so that the online phases of all runs begin at
+the same place; on an axis of frames they are all at zero, and the last one counts. The table is
 printed in Markdown. Needs the `recipes` extra; reads config.yaml and eval.csv of each run
-directory.
+directory, or of all below a folder.
 """
 
 from __future__ import annotations
@@ -21,8 +23,9 @@ from statistics import mean
 from typing import Any
 
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from omegaconf import OmegaConf
+
+from curves import draw_mean, make_panels, shared
 
 OWN_KEYS = ("seed", "run_dir", "resume", "logger", "checkpoint", "video")  # not what a run is
 
@@ -49,8 +52,14 @@ class Run:
         """Everything but the seed and where the run was written, as comparable text."""
         return str({k: v for k, v in sorted(self.config.items()) if k not in OWN_KEYS})
 
-    def column(self, name: str) -> list[float]:
-        return [row[name] for row in self.evaluations]
+    @property
+    def task(self) -> str:
+        """The environment's name."""
+        return self.config["env"]["name"]
+
+    def returns(self, x: str = "updates", name: str = "return_mean") -> dict[float, float]:
+        """A column of its evaluations by another one."""
+        return {row[x]: row[name] for row in self.evaluations}
 
 
 @dataclass(frozen=True)
@@ -77,12 +86,12 @@ class Curve:
 
     def at(self, updates: float) -> list[float]:
         """The return of each run after so many updates; none where there was no evaluation."""
-        pairs = [zip(r.column("updates"), r.column("return_mean"), strict=True) for r in self.runs]
-        return [value for run in pairs for when, value in run if when == updates]
+        runs = [run.returns() for run in self.runs]
+        return [run[updates] for run in runs if updates in run]
 
     def shared(self) -> list[float]:
         """The updates at which all runs were evaluated."""
-        return [u for u in self.runs[0].column("updates") if len(self.at(u)) == len(self.runs)]
+        return shared([run.returns() for run in self.runs])
 
 
 def runs_in(folder: Path) -> list[Path]:
@@ -108,19 +117,14 @@ def labels(curves: Sequence[Curve]) -> list[str]:
     return [f"{x} ({n})" if plain.count(x) > 1 else x for x, n in zip(plain, names, strict=True)]
 
 
-def draw(axes: Axes, curve: Curve, label: str) -> None:
-    """Adds a curve to a figure."""
-    updates = curve.shared()
-    values = [mean(curve.at(u)) for u in updates]
-    (line,) = axes.plot(updates, values, marker="o", markersize=3, label=label)
-    if len(curve.runs) > 1:
-        for run in curve.runs:
-            thin = {"color": line.get_color(), "alpha": 0.4, "linewidth": 1}
-            axes.plot(run.column("updates"), run.column("return_mean"), **thin)
-        return
-    pairs = list(zip(values, curve.runs[0].column("return_std"), strict=True))
-    low, high = [m - s for m, s in pairs], [m + s for m, s in pairs]
-    axes.fill_between(updates, low, high, alpha=0.15, color=line.get_color(), linewidth=0)
+def draw(axes: Axes, curve: Curve, label: str, x: str = "updates") -> None:
+    """Adds a curve to a panel."""
+    line = draw_mean(axes, label, [run.returns(x) for run in curve.runs])
+    if len(curve.runs) == 1:
+        places, values = line.get_xdata(), line.get_ydata()
+        stds = curve.runs[0].returns(x, "return_std").values()
+        low, high = zip(*((v - s, v + s) for v, s in zip(values, stds, strict=True)), strict=True)
+        axes.fill_between(places, low, high, alpha=0.15, color=line.get_color(), linewidth=0)
 
 
 def unit(curves: Sequence[Curve]) -> str:
@@ -149,25 +153,28 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("output", type=Path)
     parser.add_argument("run_dirs", type=Path, nargs="+", help="or folders that hold them")
+    parser.add_argument("--x", choices=("updates", "frames"), default="updates")
     parser.add_argument("--line", action="append", default=[], help="NAME=RETURN, drawn dashed")
     arguments = parser.parse_args()
 
     curves = make_curves([run for folder in arguments.run_dirs for run in runs_in(folder)])
-    figure = Figure(figsize=(6.4, 4), layout="constrained")
-    axes = figure.subplots()
+    tasks = sorted({curve.runs[0].task for curve in curves})
+    xlabel = unit(curves) if arguments.x == "updates" else "environment frames"
+    figure, panels = make_panels(tasks, xlabel)
     for curve, label in zip(curves, labels(curves), strict=True):
-        draw(axes, curve, label)
-    if any(curve.shared()[0] < 0 for curve in curves):
-        axes.axvline(0, color="0.4", linestyle=":", linewidth=1, label="end of the offline phase")
-    for text in arguments.line:
-        name, value = text.split("=")
-        axes.axhline(float(value), color="0.4", linestyle="--", linewidth=1, label=name)
-    title = ", ".join(sorted({curve.runs[0].config["env"]["name"] for curve in curves}))
-    axes.set(title=title, xlabel=unit(curves), ylabel="evaluation return")
-    axes.grid(alpha=0.3)
-    axes.legend(frameon=False)
+        draw(panels[curve.runs[0].task], curve, label, arguments.x)
+    for axes in panels.values():
+        if axes.dataLim.x0 < 0:
+            axes.axvline(
+                0, color="0.4", linestyle=":", linewidth=1, label="end of the offline phase"
+            )
+        for text in arguments.line:
+            name, value = text.split("=")
+            axes.axhline(float(value), color="0.4", linestyle="--", linewidth=1, label=name)
+        axes.legend(frameon=False)
     figure.savefig(arguments.output, dpi=150)
-    print(table(curves))
+    for task in tasks:
+        print(f"{task}\n" * (len(tasks) > 1) + table([c for c in curves if c.runs[0].task == task]))
 
 
 if __name__ == "__main__":

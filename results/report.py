@@ -22,9 +22,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from curves import draw_mean, make_panels
 from evaluations import (
     COLUMNS,
     Row,
@@ -36,7 +36,6 @@ from evaluations import (
     read_runs,
     returns,
     scores,
-    shared_updates,
 )
 from intervals import (
     interquartile_mean,
@@ -117,25 +116,13 @@ def aggregate_table(rows: Sequence[Row], found: Scores) -> str:
 
 def draw_curves(rows: Sequence[Row], path: Path) -> None:
     """A panel for each task: the mean over seeds and its interval."""
-    tasks = names(rows, "task")
-    figure = Figure(figsize=(4 * len(tasks), 3.2), layout="constrained")
-    for task, axes in zip(tasks, figure.subplots(1, len(tasks), squeeze=False)[0], strict=True):
+    figure, panels = make_panels(names(rows, "task"), "updates")
+    for task, axes in panels.items():
         for method in names(rows, "method"):
-            draw_band(axes, method, list(by_seed(rows, task, method).values()))
-        axes.set(title=task, xlabel="updates", ylabel="return")
-        axes.grid(alpha=0.3)
-    axes.legend(frameon=False)
+            if runs := list(by_seed(rows, task, method).values()):
+                draw_mean(axes, f"{method}, n={len(runs)}", runs)
+        axes.legend(frameon=False)
     figure.savefig(path, dpi=120)
-
-
-def draw_band(axes: Axes, label: str, runs: Sequence[dict[float, float]]) -> None:
-    """The mean of runs where all were evaluated, with its interval."""
-    updates = shared_updates(runs)
-    values = [np.array([run[u] for run in runs]) for u in updates]
-    (line,) = axes.plot(updates, [v.mean() for v in values], label=f"{label}, n={len(runs)}")
-    if len(runs) > 1:
-        low, high = zip(*(interval(mean, [v]) for v in values), strict=True)
-        axes.fill_between(updates, low, high, alpha=0.2, color=line.get_color(), linewidth=0)
 
 
 def draw_points(path: Path, xlabel: str, points: dict[str, tuple[float, Any]]) -> None:

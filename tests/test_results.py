@@ -70,12 +70,32 @@ def test_curves_of_one_label_are_told_apart_and_a_run_counts_once(plot, tmp_path
         plot.make_curves([few, few])
 
 
-def test_a_curve_is_its_mean_and_each_seed(plot, tmp_path):
+def test_a_curve_is_its_mean_with_an_interval_over_seeds_or_episodes(plot, tmp_path):
     runs = [write_run(tmp_path / f"{s}", {0: 1.0, 10: 2.0 + s}, seed=s) for s in (0, 1)]
-    axes = Figure().subplots()
-    plot.draw(axes, *plot.make_curves(runs), "both")
-    drawn = [line.get_ydata().tolist() for line in axes.lines]
-    assert drawn == [[1.0, 2.5], [1.0, 2.0], [1.0, 3.0]]
+    for run_dirs, values, band in (
+        (runs, [1.0, 2.5], (2.0, 3.0)),
+        (runs[:1], [1.0, 2.0], (1.0, 3.0)),
+    ):
+        axes = Figure().subplots()
+        plot.draw(axes, *plot.make_curves(run_dirs), "both")
+        assert [line.get_ydata().tolist() for line in axes.lines] == [values]
+        at_ten = [y for x, y in axes.collections[0].get_paths()[0].vertices if x == 10]
+        assert (min(at_ten), max(at_ten)) == band
+
+
+def test_each_task_has_a_panel_and_frames_may_be_the_axis(plot, tmp_path, monkeypatch, capsys):
+    for task, values in (("A-v1", {0: 1.0, 10: 2.0}), ("B-v1", {0: 3.0, 10: 4.0})):
+        path = write_run(tmp_path / task, values, env={"name": task})
+        rows = "updates,frames,return_mean,return_std\n0,0,{},0\n10,70,{},0\n"
+        (path / "eval.csv").write_text(rows.format(*values.values()))
+    drawn = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: drawn.extend(figure.axes))
+    command = ["plot.py", str(tmp_path / "out.png"), str(tmp_path), "--x", "frames"]
+    monkeypatch.setattr(sys, "argv", command)
+    plot.main()
+    assert [axes.get_title() for axes in drawn] == ["A-v1", "B-v1"]
+    assert [axes.lines[0].get_xdata().tolist() for axes in drawn] == [[0, 70], [0, 70]]
+    assert "A-v1\n| updates" in capsys.readouterr().out
 
 
 def test_updates_of_an_offline_phase_come_before_zero(plot, tmp_path):

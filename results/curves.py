@@ -1,0 +1,41 @@
+"""Learning curves as plot.py and report.py draw them: a panel for each task, means, intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from intervals import interval, mean
+
+Returns = dict[float, float]  # of a run, by updates or frames
+
+
+def shared(runs: Sequence[Returns]) -> list[float]:
+    """The updates or frames at which all of these runs were evaluated."""
+    return sorted(set.intersection(*(set(run) for run in runs))) if runs else []
+
+
+def make_panels(tasks: Sequence[str], xlabel: str) -> tuple[Figure, dict[str, Axes]]:
+    """A figure with a panel for each task."""
+    width = 6.4 if len(tasks) == 1 else 4 * len(tasks)
+    figure = Figure(figsize=(width, 4 if len(tasks) == 1 else 3.2), layout="constrained")
+    panels = dict(zip(tasks, figure.subplots(1, len(tasks), squeeze=False)[0], strict=True))
+    for task, axes in panels.items():
+        axes.set(title=task, xlabel=xlabel, ylabel="evaluation return")
+        axes.grid(alpha=0.3)
+    return figure, panels
+
+
+def draw_mean(axes: Axes, label: str, runs: Sequence[Returns]) -> Line2D:
+    """The mean of runs where all were evaluated, with its 95 % interval where there are several."""
+    places = shared(runs)
+    values = [np.array([run[place] for run in runs]) for place in places]
+    (line,) = axes.plot(places, [v.mean() for v in values], marker="o", markersize=3, label=label)
+    if len(runs) > 1:
+        low, high = zip(*(interval(mean, [v]) for v in values), strict=True)
+        axes.fill_between(places, low, high, alpha=0.2, color=line.get_color(), linewidth=0)
+    return line
