@@ -221,10 +221,10 @@ def table_has_rows(path: Path) -> bool:
 def test_a_run_that_was_killed_after_its_last_evaluation_goes_on(folder, tmp_path):
     shutil.copytree(folder / "sac", tmp_path / "sac")
     generate("medium_replay", tmp_path, sac=[*SAC, "optim.total_updates=60"])
-    (newest,) = (tmp_path / "sac" / "checkpoints").glob("*0060.pt")
+    (newest,) = (tmp_path / "sac" / "checkpoints").glob("checkpoint_*60.pt")
     newest.unlink()  # the table still says that 60 updates were made
     (tmp_path / "sac" / "done").unlink()
-    (old,) = (folder / "sac" / "checkpoints").iterdir()
+    (old,) = (folder / "sac" / "checkpoints").glob("checkpoint_*")
     shutil.copy(old, newest.parent)
     again = generate("medium", tmp_path, sac=[*SAC, "optim.total_updates=60"])
     assert newest.exists() and again.metadata["episodes"] == 5
