@@ -1,4 +1,4 @@
-"""Promises of results/plot.py and of the tables in results/README.md that it printed."""
+"""Promises of results/plot.py and of the tables in results/runs.md that it printed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from omegaconf import OmegaConf
 
 RESULTS = Path(__file__).parents[1] / "results"
 PLOTS = re.findall(
-    r"`python (results/plot\.py results/[^`]+)`", (RESULTS / "README.md").read_text()
+    r"`python (results/plot\.py results/[^`]+)`", (RESULTS / "runs.md").read_text()
 )
 
 
@@ -123,13 +123,13 @@ def test_a_folder_stands_for_the_runs_in_it_and_one_without_is_told(plot, tmp_pa
         plot.runs_in(tmp_path / "empty")
 
 
-def test_the_readme_has_tables_that_a_command_prints():
+def test_the_page_has_tables_that_a_command_prints():
     assert len(PLOTS) == 2
 
 
 @pytest.mark.parametrize("command", PLOTS)
-def test_tables_in_the_readme_are_what_the_command_prints(plot, command):
+def test_tables_in_the_page_are_what_the_command_prints(plot, command):
     _, _, *arguments = shlex.split(command)
     named = [a for a in arguments if a.startswith("results/")]
     run_dirs = [path for name in named for path in sorted(RESULTS.parent.glob(name))]
-    assert plot.table(plot.make_curves(run_dirs)) in (RESULTS / "README.md").read_text()
+    assert plot.table(plot.make_curves(run_dirs)) in (RESULTS / "runs.md").read_text()
