@@ -41,8 +41,24 @@ def test_jobs_are_named_by_task_method_and_seed_and_are_commands(study):
     assert jobs[3].config.optim.total_updates == 3000
 
 
-def test_every_study_of_the_package_is_a_valid_one(study):
-    assert len(study("study=table2")) == 6 * 7 * 5
+NUM_JOBS = {
+    "tiny": 1 * 2 * 2,  # tasks, methods, seeds
+    "table2": 6 * 7 * 5,
+    "short_chains": 2 * 7 * 1,
+    "rivals_short": 1 * 7 * 1,
+    "guidance_weight": 2 * 6 * 2,
+    "num_steps": 2 * 5 * 2,
+    "beyond": 2 * 8 * 2,
+}
+
+
+@pytest.mark.parametrize("path", sorted((CONFIGS / "study").glob("*.yaml")), ids=lambda p: p.stem)
+def test_every_study_of_the_package_is_a_valid_one(study, path):
+    jobs = study(f"study={path.stem}")
+    assert len(jobs) == NUM_JOBS[path.stem]
+    # No two methods are the same but for their names.
+    settings = {(job.config.model_dump_json(), job.command[-3]) for job in jobs}
+    assert len(settings) == len(jobs)
 
 
 @pytest.mark.parametrize(
