@@ -5,7 +5,9 @@
 For each checkpoint, and each spacing and number of levels, on the newest states that the run has
 seen: the mean value of the actions, the spread of a state's candidates, and a permutation test of
 the energy distance on each of a few states. Writes fidelity.csv and fidelity.png, and prints the
-table. The critic was trained with the chain of its own run; every chain here runs on that critic.
+table; border.csv tells how much of the clean estimate the clip moves at each level, where the chain
+is free to skip. The critic was trained with the chain of its own run; every chain here runs on that
+critic.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ from torch import Tensor
 
 import renderer  # noqa: F401
 from fidelity.figure import draw, print_table
-from fidelity.measures import energy_distance_test, spread
+from fidelity.measures import border_shares, energy_distance_test, spread
 from fidelity.spacings import PACKAGE, SPACINGS, levels_of
 from torchrl_aca import CriticGuidedDenoisingActor
 from torchrl_aca.errors import RunError
@@ -33,15 +35,10 @@ CANDIDATES, TEST_SAMPLES, PERMUTATIONS = 128, 2000, 199  # of a state
 
 
 def measure_checkpoint(
-    policy: dict[str, Any], checkpoint: dict[str, Any], args: argparse.Namespace
+    actor: CriticGuidedDenoisingActor, policy: dict[str, Any], states: Tensor, args: Any
 ) -> Iterator[dict[str, Any]]:
     """Yields a row for each chain; the first is the whole chain against itself, on other draws."""
-    actor, config = build_policy(policy), policy["config"]
-    if not isinstance(actor, CriticGuidedDenoisingActor):
-        name = config["algo"]["name"]
-        raise RunError(f"algo={name} has no chain to shorten. Give runs of algo=aca.")
-    rows = checkpoint["parts"]["buffer"]["rows"]["observation"]
-    states = rows[-args.states :]
+    config = policy["config"]
     tested = states[:: max(len(states) // args.tested_states, 1)][: args.tested_states]
     num_steps = actor.schedule.num_steps
     about = {
@@ -121,16 +118,39 @@ def compare(
     }
 
 
-def measure_runs(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """Yields the rows of every checkpoint that is asked for, of every run."""
+def checkpoints(args: argparse.Namespace) -> Iterator[tuple[str, int, dict[str, Any], Tensor]]:
+    """Yields every checkpoint that is asked for: run, updates, policy, and the newest states."""
     for run_dir in args.runs:
         kept = [updates_of(path) for path in list_checkpoints(run_dir / "checkpoints")]
         for updates in args.updates or kept[-1:] or [None]:
             checkpoint = read_checkpoint(run_dir, updates)
-            policy = read_policy(run_dir, updates)
-            for row in measure_checkpoint(policy, checkpoint, args):
-                print(f"{run_dir.name} {updates}: {row['spacing']} {row['levels']}", flush=True)
-                yield {"run": run_dir.name, "updates": updates, **row}
+            states = checkpoint["parts"]["buffer"]["rows"]["observation"][-args.states :]
+            yield run_dir.name, updates, read_policy(run_dir, updates), states
+
+
+def guided(policy: dict[str, Any]) -> CriticGuidedDenoisingActor:
+    """The actor of a policy's file."""
+    actor, name = build_policy(policy), policy["config"]["algo"]["name"]
+    if name != "aca":
+        raise RunError(f"algo={name} has no chain to shorten. Give runs of algo=aca.")
+    return actor
+
+
+def measure_runs(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """Yields a row for each chain of every checkpoint."""
+    for run, updates, policy, states in checkpoints(args):
+        for row in measure_checkpoint(guided(policy), policy, states, args):
+            print(f"{run} {updates}: {row['spacing']} {row['levels']}", flush=True)
+            yield {"run": run, "updates": updates, **row}
+
+
+def measure_borders(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """Yields a row for each level of the whole chain of every checkpoint."""
+    for run, updates, policy, states in checkpoints(args):
+        actor = guided(policy)
+        whole = _Chain(actor, list(range(1, actor.schedule.num_steps + 1)), args)
+        for level, share in enumerate(border_shares(whole.actor, states, 8), start=1):
+            yield {"run": run, "updates": updates, "level": level, "clipped": share}
 
 
 def write(rows: Iterator[dict[str, Any]], path: Path) -> list[dict[str, Any]]:
@@ -165,6 +185,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     args = parse(arguments)
     torch.manual_seed(0)
     try:
+        write(measure_borders(args), args.out / "border.csv")
         rows = write(measure_runs(args), args.out / "fidelity.csv")
     except RunError as error:
         sys.exit(f"error: {error}")

@@ -6,11 +6,11 @@ import pytest
 import torch
 
 import chain_fidelity
-from fidelity.measures import energy_distance_test, spread
+from fidelity.measures import border_shares, energy_distance_test, spread
 from fidelity.spacings import PACKAGE, SPACINGS, levels_of
 from online_mujoco import train
 from recipe_cases import TINY, composed, rows_of
-from torchrl_aca import NoiseSchedule
+from torchrl_aca import CriticGuidedDenoisingActor, NoiseLevelCritic, NoiseSchedule
 from torchrl_aca.chain import check_levels, inference_levels
 
 
@@ -33,6 +33,21 @@ def test_the_test_tells_a_shift_from_none():
 def test_the_spread_is_over_the_candidates():
     # Deviations of (0, 2) and (1, 1): sqrt 2 and 0.
     assert spread(torch.tensor([[0.0, 1.0], [2.0, 1.0]])) == pytest.approx(2**0.5 / 2)
+
+
+def test_shares_at_the_border_by_hand():
+    torch.manual_seed(0)
+    critic = NoiseLevelCritic(3, 2, num_steps=4, num_cells=(8,))
+    states, schedule = torch.zeros(5, 3), NoiseSchedule.cosine(4)
+    strong = CriticGuidedDenoisingActor(critic, schedule, guidance_weight=1e6)
+    assert border_shares(strong, states, 6)[1:] == [1.0, 1.0, 1.0]  # level 1 has no posterior noise
+    idle = CriticGuidedDenoisingActor(critic, schedule, guidance_weight=0.0)
+    torch.manual_seed(1)
+    shares = border_shares(idle, states, 6)
+    torch.manual_seed(1)
+    path = idle.trajectory(states, torch.randn(5, 6, 5, 2))
+    beyond = [(path[4 - k].abs() > schedule.alphas_cumprod[k - 1].sqrt()) for k in (1, 2, 3, 4)]
+    assert shares == pytest.approx([float(b.double().mean()) for b in beyond])
 
 
 @pytest.mark.parametrize("spacing", [PACKAGE, *SPACINGS])
@@ -71,6 +86,8 @@ def test_the_command_compares_chains_on_the_checkpoints_of_a_run(
     assert [row["gradients"] for row in rows] == 2 * ["4", *["2"] * (1 + len(SPACINGS))]
     assert {row["normalized"] for row in rows} == {str(not raw)}
     assert all(0.5 < float(row["std_ratio"]) < 2 for row in rows if row["spacing"] == "all")
+    levels = [row["level"] for row in rows_of(out / "border.csv")]
+    assert levels == 2 * ["1", "2", "3", "4", "5"]
     assert (out / "fidelity.png").stat().st_size > 0
     assert "| all | 4 | 1 2 3 4 5 |" in capsys.readouterr().out
     with pytest.raises(SystemExit, match="expected a checkpoint of 7 updates, found those of"):

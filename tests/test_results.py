@@ -15,9 +15,7 @@ from matplotlib.figure import Figure
 from omegaconf import OmegaConf
 
 RESULTS = Path(__file__).parents[1] / "results"
-PLOTS = re.findall(
-    r"`python (results/plot\.py results/[^`]+)`", (RESULTS / "runs.md").read_text()
-)
+PLOTS = re.findall(r"`python (results/plot\.py results/[^`]+)`", (RESULTS / "runs.md").read_text())
 
 
 @pytest.fixture(scope="module")

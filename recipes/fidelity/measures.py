@@ -5,6 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchrl_aca import CriticGuidedDenoisingActor
+from torchrl_aca import functional as F
+
 
 def energy_distance_test(
     samples: Tensor, others: Tensor, num_permutations: int, generator: torch.Generator
@@ -39,3 +42,33 @@ def energy_distance_test(
 def spread(candidates: Tensor) -> float:
     """The standard deviation over the candidates, dimension 0, averaged over all else."""
     return float(candidates.std(0).mean())
+
+
+@torch.no_grad()
+def border_shares(
+    actor: CriticGuidedDenoisingActor, states: Tensor, num_candidates: int
+) -> list[float]:
+    """How many coordinates of the clean estimate the clip moves, at each level of a whole chain.
+
+    Args:
+        actor: An actor that visits all of its levels.
+        states: Observations of shape `(states, O)`.
+        num_candidates: Chains for each state.
+
+    Returns:
+        The shares, from level 1 to T.
+    """
+    schedule, shape = actor.schedule, (num_candidates, len(states), actor.action_dim)
+    path = actor.trajectory(states, torch.randn(schedule.num_steps + 1, *shape))
+    features = actor.encode(states, states.shape[:-1])
+    shares = []
+    for level in schedule.noise_levels:
+        action = path[schedule.num_steps - level]
+        gradient = actor.critic.action_gradient(features, action, level)
+        if actor.normalize_gradient:
+            gradient = F.normalize_gradient(gradient)
+        sigma = schedule.posterior_variance[level - 1].sqrt()
+        noise = F.guided_noise(gradient, actor.guidance_weight, sigma)
+        clean = F.predict_clean(action, noise, schedule.alphas_cumprod[level - 1])
+        shares.append(float((clean.abs() > 1).double().mean()))
+    return shares
