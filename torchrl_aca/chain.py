@@ -35,8 +35,9 @@ def inference_levels(num_levels: int, num_steps: int) -> list[int]:
 
     Level ``k`` of ``S`` is ``1 + (T - 1) ((k - 1) / (S - 1))^4``, rounded, or the next free one
     where that is taken. The low levels decide the action: the stride of the guidance falls with the
-    level, and the last strides leave the spread of the candidates. At the high levels the clean
-    estimate lies on the border of its box, whatever the stride.
+    level, and the last strides leave the spread of the candidates. At the high levels the clip
+    decides the clean estimate, whatever the stride: with the cosine and the vp schedule, not with
+    the linear one, for which explicit levels are better.
 
     Args:
         num_levels: number ``T`` of noise levels.
