@@ -5,10 +5,14 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import imageio.v3 as imageio
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from evaluate import EvaluateConfig, evaluate_runs, summary
+from film import animate
 from online_mujoco import train
 from recipe_cases import TINY_SIZES, composed, rows_of, run
 from test_policy import RUN
@@ -108,3 +112,16 @@ def test_the_command_says_what_is_missing(tmp_path):
     assert "error: " in errors and "checkpoints/policy_*.pt, found none" in errors
     code, _, errors = run(cwd=tmp_path, recipe="evaluate")
     assert code == 1 and "error: run=???: expected a value" in errors
+
+
+def test_an_animation_is_the_beginning_of_a_film_made_small(tmp_path):
+    film, output = tmp_path / "film.mp4", tmp_path / "pages" / "film.gif"
+    images = np.zeros((40, 64, 96, 3), dtype=np.uint8)
+    images[:, :, :, 0] = 6 * np.arange(40)[:, None, None]  # it grows red
+    imageio.imwrite(film, images, fps=20, macro_block_size=1)
+    animate(film, output, seconds=1.0, width=48)
+    with Image.open(output) as gif:
+        assert gif.size == (48, 32) and gif.n_frames == 10 and gif.info["duration"] == 100
+        gif.seek(9)
+        red = np.asarray(gif.convert("RGB"))[..., 0].mean()
+    assert abs(red - 6 * 18) < 12
