@@ -789,3 +789,12 @@ def test_the_guidance_weight_reaches_a_spawned_worker(collect_from_spawned_worke
     batch = next(batches).clone()
     unguided = actor.sample(batch["observation"], batch.shape, deterministic=True)
     torch.testing.assert_close(batch["action"], unguided, rtol=0, atol=1e-3)
+
+
+def test_one_candidate_is_taken_without_a_look_at_its_value(monkeypatch):
+    actor = make_actor(num_candidates=1)
+    candidates = torch.rand(1, 1, actor.action_dim)
+    calls = []
+    monkeypatch.setattr(actor.critic, "evaluate", lambda *args: calls.append(args))
+    assert torch.equal(actor.select(torch.zeros(1, OBS), candidates), candidates[0])
+    assert not calls

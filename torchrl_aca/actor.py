@@ -229,8 +229,12 @@ class CriticGuidedDenoisingActor(ChainPolicy):
         """
         batch = candidates.shape[1:-1]
         rows = candidates.reshape(candidates.shape[0], -1, candidates.shape[-1])
-        values = self.values(self.encode(observation, batch), rows)
-        return F.select_best(rows, values).reshape(candidates.shape[1:])
+        return self._best(self.encode(observation, batch), rows).reshape(candidates.shape[1:])
+
+    def _best(self, features: Any, candidates: Tensor) -> Tensor:
+        if len(candidates) == 1:  # no choice, so no values
+            return candidates[0]
+        return F.select_best(candidates, self.values(features, candidates))
 
     def _from_noise(
         self, observation: Tensor | Sequence[Tensor], noise: Tensor, keep_path: bool
@@ -338,8 +342,7 @@ class CriticGuidedDenoisingActor(ChainPolicy):
         batch = torch.Size(batch)
         features = self.encode(observation, batch)
         draws = self.draws(batch.numel(), num_candidates, deterministic)
-        candidates = self.propose(features, draws[:-1])
-        best = F.select_best(candidates, self.values(features, candidates))
+        best = self._best(features, self.propose(features, draws[:-1]))
         action = self.explore(best, draws[-1, 0])
         return self.to_env(action).reshape(*batch, self.action_dim)
 

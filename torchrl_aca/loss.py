@@ -278,14 +278,16 @@ class ACALoss(OpenLoopAlpha, AutoGuidance, TDLoss):
         draws = actor.draws(batch.numel(), self.num_target_candidates)
         candidates = self._candidates(features, draws[:-1])
         soft = self.target_value == "soft"
-        if self.auto_guidance or not soft:
+        choosing = not soft and len(candidates) > 1
+        if self.auto_guidance or choosing:
             values = actor.values(features, candidates)
         if self.auto_guidance:
             self._note_guidance(tensordict, candidates, values)
         if soft:
             action = actor.explore(candidates, draws[-1]).movedim(0, 1)
         else:
-            action = actor.explore(F.select_best(candidates, values), draws[-1, 0])
+            best = F.select_best(candidates, values) if choosing else candidates[0]
+            action = actor.explore(best, draws[-1, 0])
         return actor.to_env(action).reshape(*batch, *action.shape[1:])
 
     @torch.no_grad()
