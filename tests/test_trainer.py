@@ -70,6 +70,16 @@ def test_a_restored_stepper_goes_on_with_its_count_and_optimisers():
         assert torch.equal(mine, theirs)
 
 
+def test_a_guidance_weight_that_tunes_itself_moves():
+    torch.manual_seed(0)
+    loss = make_loss(guidance_weight="auto", num_target_candidates=4)
+    before = loss.guidance_weight.clone()
+    stepper = ACAOptimizationStepper(*optimisers(loss))
+    metrics = stepper.step(trainer_of(loss), make_data(6))
+    assert loss.actor_network.guidance_weight != before
+    assert metrics["guidance_weight"] == loss.guidance_weight.float()
+
+
 @pytest.mark.parametrize("name", ["noise_level_interval", "alpha_interval"])
 def test_an_interval_below_one_is_told(name):
     with pytest.raises(ValueError, match=f"{name}.*0"):

@@ -16,9 +16,9 @@ __all__ = ["ACAOptimizationStepper"]
 class ACAOptimizationStepper(OptimizationStepper):
     """The update of ACA for ``Trainer(optimization_stepper=...)``, in the official code's order.
 
-    A TD step; at even updates a step of the same optimiser on the noise-level loss, at the
-    parameters after the first; at every 250th a step on alpha. The trainer's own
-    ``target_net_updater`` moves the targets after each update.
+    A TD step, and one of a guidance weight that tunes itself; at even updates a step of the same
+    optimiser on the noise-level loss, at the parameters after the first; at every 250th a step on
+    alpha. The trainer's own ``target_net_updater`` moves the targets after each update.
 
     Args:
         critic_optimizer: of the critic's parameters.
@@ -60,11 +60,13 @@ class ACAOptimizationStepper(OptimizationStepper):
         """Make one update on a batch of transitions, with ``trainer.loss_module``.
 
         Returns:
-            The latest losses and metrics of each of the three, detached: the trainer averages over
+            The latest losses and metrics of each of its steps, detached: the trainer averages over
             updates, and wants the same names from each.
         """
         loss = trainer.loss_module
         self._descend("qvalue", loss.qvalue_loss(sub_batch), self.critic_optimizer)
+        if loss.auto_guidance:
+            self._latest["guidance_weight"] = loss.step_guidance_weight(sub_batch)
         if self.updates % self.noise_level_interval == 0:
             self._descend("noise_level", loss.noise_level_loss(sub_batch), self.critic_optimizer)
         if self.updates % self.alpha_interval == 0:
