@@ -35,7 +35,6 @@ from data.offline import (
     task_scores,
 )
 from torchrl_aca.offline.scores import normalized_score
-from torchrl_aca.training.collection import Collection
 from torchrl_aca.training.config import Count, RunConfig, Share, is_number
 from torchrl_aca.training.envs import make_vector_env
 from torchrl_aca.training.evaluation import evaluate, make_eval_env, report_extras
@@ -43,6 +42,7 @@ from torchrl_aca.training.launch import launch, make_device
 from torchrl_aca.training.logging import require_wandb_login
 from torchrl_aca.training.randomness import seed_everything
 from torchrl_aca.training.run import Run
+from torchrl_aca.training.workers import make_collection
 
 
 class OfflineToOnlineConfig(RunConfig):
@@ -87,7 +87,7 @@ def train(cfg: DictConfig, checkpoint: dict[str, Any] | None = None) -> Path:
     require_offline_phase(cfg, agent)
     dataset, scores = load_offline_data(cfg, env), task_scores(cfg)
     buffer = make_mixture(cfg, dataset, agent)
-    collection = Collection(env, agent.policy, cfg.collector, device)
+    collection = make_collection(cfg, env, agent.policy, device)
     facts = {
         **offline_facts(dataset, buffer),
         "updates per online frame": f"{cfg.optim.utd_ratio:g}",

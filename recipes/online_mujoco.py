@@ -23,13 +23,13 @@ import help_text  # noqa: F401
 import renderer  # noqa: F401
 from agents import configured, make_agent
 from torchrl_aca.replay import make_replay_buffer
-from torchrl_aca.training.collection import Collection
 from torchrl_aca.training.envs import make_vector_env
 from torchrl_aca.training.evaluation import evaluate, make_eval_env, report_extras
 from torchrl_aca.training.launch import launch, make_device
 from torchrl_aca.training.logging import require_wandb_login
 from torchrl_aca.training.randomness import seed_everything
 from torchrl_aca.training.run import Run
+from torchrl_aca.training.workers import make_collection
 
 
 def train(cfg: DictConfig, checkpoint: dict[str, Any] | None = None) -> Path:
@@ -43,7 +43,7 @@ def train(cfg: DictConfig, checkpoint: dict[str, Any] | None = None) -> Path:
     eval_env = make_eval_env(cfg.env, cfg.eval)
     agent = make_agent(cfg, env, device)
     buffer = make_replay_buffer(cfg.buffer.capacity, cfg.optim.batch_size)
-    collection = Collection(env, agent.policy, cfg.collector, device)
+    collection = make_collection(cfg, env, agent.policy, device)
     evaluation = partial(evaluate, agent.policy, eval_env, cfg.eval.seed, device)
 
     with Run(

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torchrl.collectors import Collector
+from torchrl.collectors import BaseCollector, Collector
 from torchrl.envs import GymWrapper
 
 from torchrl_aca.errors import RunError
@@ -55,35 +55,42 @@ class Collection:
         self.frames = 0
         self.episodes = EpisodeTracker(env.batch_size.numel())
         self.savable = True
-        self._collector: Collector | None = None
+        self._collector: BaseCollector | None = None
 
     def __iter__(self) -> Iterator[TensorDictBase]:
         """Collects; what is restored must be restored before."""
-        self._collector = self._build()
-        for data in self._collector:
+        for data in self._batches():
             check_finite(data, self.frames)
             self.frames += data.numel()
             self.episodes.add(data)
             yield data
+
+    def _batches(self) -> Iterator[TensorDictBase]:
+        self._collector = self._build()
+        for data in self._collector:
+            yield data
             self._collector.update_policy_weights_()
 
-    def _build(self) -> Collector:
+    def _build(self) -> BaseCollector:
         random = RandomState().state_dict() if self.frames else None
         random_frames = self.settings.warmup_frames if self.settings.warmup == "random" else 0
-        collector = Collector(
+        collector = self._make_collector(max(0, random_frames - self.frames))
+        if random:  # building draws random numbers: a run that goes on has drawn them before
+            RandomState().load_state_dict(random)
+        return collector
+
+    def _make_collector(self, random_frames: int) -> BaseCollector:
+        return Collector(
             self.env,
             self.policy,
             frames_per_batch=self.settings.frames_per_batch,
-            init_random_frames=max(0, random_frames - self.frames),
+            init_random_frames=random_frames,
             total_frames=-1,
             policy_device=self.device,
             env_device="cpu",
             storing_device="cpu",
             auto_register_policy_transforms=False,  # these policies are feed-forward
         )
-        if random:  # building draws random numbers: a run that goes on has drawn them before
-            RandomState().load_state_dict(random)
-        return collector
 
     def close(self) -> None:
         """Ends the collector and its environments."""

@@ -66,6 +66,17 @@ class Collector(Section):
     frames_per_batch: Count
     warmup_frames: Count
     warmup: Literal["random", "policy"]
+    backend: Literal["direct", "multi_process", "ray"] = "direct"
+    num_workers: Count = 1
+    max_restarts: Annotated[int, Field(ge=0)] = 3
+
+    @model_validator(mode="after")
+    def _workers(self) -> Collector:
+        if self.backend == "direct" and self.num_workers > 1:
+            self.refuse("num_workers", "1, or another collector.backend than direct")
+        if self.num_envs % self.num_workers:
+            self.refuse("num_workers", f"a divisor of collector.num_envs ({self.num_envs})")
+        return self
 
 
 class Buffer(Section):
