@@ -72,7 +72,8 @@ class WorkerCollection(Collection):
     def _batches(self) -> Iterator[TensorDictBase]:
         while True:
             try:
-                for data in super()._batches():
+                self._collector = self._build()
+                for data in self._collector:  # which brings the weights over before each batch
                     yield data.reshape(-1, data.shape[-1])  # (workers, environments, steps)
             except Exception as error:  # which one depends on when a worker dies, and of what
                 self._restart(error)
@@ -119,6 +120,7 @@ class WorkerCollection(Collection):
 
     def _process_options(self) -> dict[str, Any]:
         return {
+            "update_at_each_batch": True,  # after a look whether all live: a dead one never answers
             "policy_device": self.device,
             "env_device": "cpu",
             "storing_device": "cpu",
@@ -127,7 +129,11 @@ class WorkerCollection(Collection):
 
     def _ray_options(self) -> dict[str, Any]:
         kwargs = {"auto_register_policy_transforms": False}
-        return {"remote_configs": {"num_cpus": 1}, "collector_kwargs": kwargs}
+        return {
+            "update_after_each_batch": True,
+            "remote_configs": {"num_cpus": 1},
+            "collector_kwargs": kwargs,
+        }
 
     def close(self) -> None:
         """Ends the workers, the dead ones as well."""
