@@ -41,6 +41,15 @@ def test_jobs_are_named_by_task_method_and_seed_and_are_commands(study):
     assert jobs[3].config.optim.total_updates == 3000
 
 
+def test_a_study_of_the_other_recipe_has_its_keys(study):
+    job = study("study=offline_to_online", "dir=/s")[-1]
+    assert job.command[1].endswith("o2o_halfcheetah.py")
+    assert job.dir.name == "HalfCheetah-v4-random-calql-s1"
+    assert (job.config.offline_updates, job.config.optim.total_updates) == (5000, 5000)
+    with pytest.raises(RunError, match="recipe='bandit_2d': expected"):
+        study("study=tiny", "+study.recipe=bandit_2d")
+
+
 NUM_JOBS = {
     "tiny": 1 * 2 * 2,  # tasks, methods, seeds
     "table2": 6 * 7 * 5,
@@ -49,6 +58,7 @@ NUM_JOBS = {
     "guidance_weight": 2 * 6 * 2,
     "num_steps": 2 * 5 * 2,
     "beyond": 2 * 8 * 2,
+    "offline_to_online": 2 * 7 * 2,
 }
 
 

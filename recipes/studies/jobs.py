@@ -14,19 +14,21 @@ from omegaconf import OmegaConf
 from pydantic import Field
 
 from agents import configured
+from o2o_halfcheetah import OfflineToOnlineConfig
 from torchrl_aca.errors import RunError
 from torchrl_aca.training.config import Count, RunConfig, Section, Seed
 
-SCRIPT = Path(__file__).parents[1] / "online_mujoco.py"
+FOLDER = Path(__file__).parents[1]
 
 Name = Annotated[str, Field(pattern=r"^[\w.+-]+$")]  # a part of a directory's name
 Overrides = dict[Name, list[str]]
 
 
 class Study(Section):
-    """`configs/study/<name>.yaml`; lists hold what one would type behind `online_mujoco.py`."""
+    """`configs/study/<name>.yaml`; lists hold what one would type behind its recipe."""
 
     name: Name
+    recipe: Literal["online_mujoco", "o2o_halfcheetah"] = "online_mujoco"
     config: str
     tasks: Annotated[Overrides, Field(min_length=1)]
     methods: Annotated[Overrides, Field(min_length=1)]
@@ -75,19 +77,21 @@ class Job:
     Attributes:
         method: The study's name of it.
         dir: The run directory, named by task, method and seed.
+        script: The recipe that it runs.
         config: The configuration, which has where the run ends.
         overrides: What the command says.
     """
 
     method: str
     dir: Path
+    script: Path
     config: RunConfig
     overrides: tuple[str, ...]
 
     @property
     def command(self) -> list[str]:
         """What one would type: typed again, it goes on with the run."""
-        return [sys.executable, str(SCRIPT), *self.overrides]
+        return [sys.executable, str(self.script), *self.overrides]
 
     @property
     def output(self) -> Path:
@@ -116,10 +120,11 @@ def make_jobs(cfg: StudyConfig) -> list[Job]:
 
 def _jobs_of(cfg: StudyConfig, task: str, method: str) -> Iterator[Job]:
     study = cfg.study
+    schema = OfflineToOnlineConfig if study.recipe == "o2o_halfcheetah" else RunConfig
     chosen = [*study.tasks[task], *study.methods[method], *study.settings]
     try:
         composed = hydra.compose(study.config, [*chosen, f"num_threads={cfg.threads}"])
-        config = configured(composed)
+        config = configured(composed, schema)
     except (HydraException, RunError) as error:
         raise RunError(f"study={study.name}, {method} on {task}: {error}") from None
     for seed in study.seeds:
@@ -133,7 +138,7 @@ def _jobs_of(cfg: StudyConfig, task: str, method: str) -> Iterator[Job]:
             f"run_dir={run_dir}",
             "existing=resume",
         )
-        yield Job(method, run_dir, config, overrides)
+        yield Job(method, run_dir, FOLDER / f"{study.recipe}.py", config, overrides)
 
 
 def write_study(cfg: StudyConfig) -> None:
