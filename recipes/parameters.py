@@ -15,7 +15,6 @@ from pathlib import Path
 import hydra
 import torch
 from omegaconf import DictConfig
-from torch import nn
 from torchrl.envs import EnvBase
 
 import renderer  # noqa: F401
@@ -40,23 +39,19 @@ def compose(*overrides: str) -> DictConfig:
         return hydra.compose("online_mujoco", list(overrides))
 
 
-def make_loss(algo: str, env_name: str, env: EnvBase) -> nn.Module:
-    """The loss of a method with its own settings, which holds all of its networks."""
+def count(algo: str, env_name: str, env: EnvBase) -> tuple[int, int]:
+    """Parameters of a method that are trained, and those with their targets and averages."""
     cfg = configured(compose(f"algo={algo}", f"env={env_name}"))
-    return make_agent(cfg, env, torch.device("cpu")).state["loss"]
-
-
-def count(loss: nn.Module) -> tuple[int, int]:
-    """Parameters that are trained, and those with their targets and averages."""
-    trained = sum(p.numel() for p in loss.parameters() if p.requires_grad and p.ndim)
-    targets = [b for name, b in loss.named_buffers() if name.startswith("target_") and b.ndim]
-    return trained, trained + sum(target.numel() for target in targets)
+    agent = make_agent(cfg, env, torch.device("cpu"))
+    buffers = agent.state["loss"].named_buffers()
+    targets = [b for name, b in buffers if name.startswith("target_") and b.ndim]
+    return agent.num_parameters, agent.num_parameters + sum(b.numel() for b in targets)
 
 
 def table(env_name: str) -> str:
     """A row for each method: counts, their ratios to SAC's, and the paper's ratio."""
     env = make_vector_env(configured(compose(f"env={env_name}")).env.name, 1, 0)
-    counts = {algo: count(make_loss(algo, env_name, env)) for algo in AGENTS}
+    counts = {algo: count(algo, env_name, env) for algo in AGENTS}
     env.close()
     lines = [
         "| method | parameters | ratio | paper | with targets | ratio |",

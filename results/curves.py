@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -19,15 +19,25 @@ def shared(runs: Sequence[Returns]) -> list[float]:
     return sorted(set.intersection(*(set(run) for run in runs))) if runs else []
 
 
-def make_panels(tasks: Sequence[str], xlabel: str) -> tuple[Figure, dict[str, Axes]]:
+def make_panels(
+    tasks: Sequence[str], xlabel: str, ylabel: str = "evaluation return"
+) -> tuple[Figure, dict[str, Axes]]:
     """A figure with a panel for each task."""
     width = 6.4 if len(tasks) == 1 else 4 * len(tasks)
     figure = Figure(figsize=(width, 4 if len(tasks) == 1 else 3.2), layout="constrained")
     panels = dict(zip(tasks, figure.subplots(1, len(tasks), squeeze=False)[0], strict=True))
     for task, axes in panels.items():
-        axes.set(title=task, xlabel=xlabel, ylabel="evaluation return")
+        axes.set(title=task, xlabel=xlabel, ylabel=ylabel)
         axes.grid(alpha=0.3)
     return figure, panels
+
+
+def draw_marks(axes: Axes, lines: Mapping[str, float]) -> None:
+    """The end of an offline phase, which is at zero, and returns to compare with, dashed."""
+    if axes.dataLim.x0 < 0:
+        axes.axvline(0, color="0.4", linestyle=":", linewidth=1, label="end of the offline phase")
+    for label, value in lines.items():
+        axes.axhline(value, color="0.4", linestyle="--", linewidth=1, label=label)
 
 
 def draw_mean(axes: Axes, label: str, runs: Sequence[Returns]) -> Line2D:

@@ -1,18 +1,25 @@
-"""The evaluations of a study as rows of one table: read from run directories, and compared."""
+"""The evaluations of a study as rows of one table: read from run directories, and compared.
+
+Updates of an offline phase are below zero, so that the online phases of all runs begin at the same
+place; on an axis of frames they are all at zero, and the last one counts.
+"""
 
 from __future__ import annotations
 
 import csv
+import json
+from bisect import bisect_right
 from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from curves import shared
 
+TEXT = ("method", "task", "commit")
 COLUMNS = [
     "method",
     "task",
@@ -22,11 +29,17 @@ COLUMNS = [
     "return_mean",
     "return_std",
     "num_episodes",
+    "normalized_score",
+    "seconds",
     "updates_per_second",
+    "parameters",
+    "commit",
 ]
-TEXT = ("method", "task")
 Row = dict[str, Any]
 Scores = dict[str, list[np.ndarray]]  # of each method, for each task
+
+
+# --- reading --------------------------------------------------------------------------------------
 
 
 def read_csv(path: Path) -> list[Row]:
@@ -36,40 +49,78 @@ def read_csv(path: Path) -> list[Row]:
     return [{k: v if k in TEXT or not v else float(v) for k, v in row.items()} for row in rows]
 
 
-def read_runs(folder: Path) -> list[Row]:
-    """Every evaluation of the runs below a folder; a run without an update is left out."""
-    runs = [path.parent for path in sorted(folder.rglob("eval.csv"))]
-    rows = [row for run in runs for row in read_run(run)]
+def read_evaluations(run_dir: Path) -> tuple[DictConfig, list[Row]]:
+    """The configuration of a run, and its evaluations, those of an offline phase below zero."""
+    rows = read_csv(run_dir / "eval.csv")
+    for row in rows:
+        row["updates"] += row.get("offline_updates", 0) - rows[-1].get("offline_updates", 0)
+    return OmegaConf.load(run_dir / "config.yaml"), rows
+
+
+def read_study(source: Path) -> list[Row]:
+    """Every evaluation of a study: its CSV, or the runs below its folder.
+
+    A run without an update is left out, and a column that a CSV lacks is empty.
+    """
+    if source.suffix == ".csv":
+        return [dict.fromkeys(COLUMNS, "") | row for row in read_csv(source)]
+    rows = [row for path in sorted(source.rglob("eval.csv")) for row in read_run(path.parent)]
     if not rows:
-        raise SystemExit(f"error: {folder}: expected directories of runs that have begun to train.")
+        raise SystemExit(f"error: {source}: expected directories of runs that have begun to train.")
     return rows
 
 
 def read_run(run_dir: Path) -> list[Row]:
-    """The evaluations of a run, with what it is."""
-    config, rows = OmegaConf.load(run_dir / "config.yaml"), read_csv(run_dir / "eval.csv")
-    if not rows or rows[-1]["updates"] == 0:
+    """The evaluations of a run, with what it is and what it took."""
+    config, rows = read_evaluations(run_dir)
+    if len({row["updates"] for row in rows}) < 2:
         return []
     metrics = read_csv(run_dir / "metrics.csv") if (run_dir / "metrics.csv").exists() else []
     speeds = [row["updates_per_second"] for row in metrics if row.get("updates_per_second")]
+    task, method = place_in_study(run_dir, config)
     own = {
-        "task": config.env.name,
-        "method": method_of(run_dir, config),
+        "task": task,
+        "method": method,
         "seed": config.seed,
         "updates_per_second": round(float(np.median(speeds)), 3) if speeds else "",
+        **{name: _versions(run_dir).get(name) or "" for name in ("parameters", "commit")},
     }
-    return [{name: {**row, **own}[name] for name in COLUMNS} for row in rows]
+    times = _times(metrics, rows)
+    return [
+        dict.fromkeys(COLUMNS, "")
+        | {name: value for name, value in row.items() if name in COLUMNS}
+        | own
+        | {"seconds": seconds}
+        for row, seconds in zip(rows, times, strict=True)
+    ]
 
 
-def method_of(run_dir: Path, config: Any) -> str:
-    """What the study calls the method of a run; outside of a study the algorithm."""
+def _versions(run_dir: Path) -> dict[str, Any]:
+    path = run_dir / "versions.json"
+    return json.loads(path.read_text()) if path.exists() else {}
+
+
+def _times(metrics: Sequence[Row], rows: Sequence[Row]) -> list[Any]:
+    """When each evaluation was made, by the latest row of metrics before it: seconds."""
+    timed = [row for row in metrics if row.get("seconds")]
+    places = [row["updates"] + row.get("offline_updates", 0) for row in timed]
+    offset = -rows[0]["updates"]  # of the offline phase
+    found = [bisect_right(places, row["updates"] + offset) for row in rows]
+    return [round(timed[i - 1]["seconds"], 1) if i else 0.0 for i in found]
+
+
+def place_in_study(run_dir: Path, config: Any) -> tuple[str, str]:
+    """A study's names of a run's task and method; outside of one, environment and algorithm."""
     path = run_dir.parent / "study.yaml"
     if path.exists():
         study = OmegaConf.load(path)
         for task, method in product(study.tasks, study.methods):
             if run_dir.name == f"{task}-{method}-s{config.seed}":
-                return method
-    return config.algo.name
+                return task, method
+    return config.env.name, config.algo.name
+
+
+# --- comparing ------------------------------------------------------------------------------------
 
 
 def names(rows: Sequence[Row], key: str) -> list[str]:
@@ -77,37 +128,52 @@ def names(rows: Sequence[Row], key: str) -> list[str]:
     return list(dict.fromkeys(row[key] for row in rows))
 
 
+def viewed(rows: Sequence[Row], x: str, value: str) -> list[Row]:
+    """The rows with what is compared, `value`, and where, `x`; those without it are left out."""
+    return [row | {"x": row[x], "value": row[value]} for row in rows if row[value] != ""]
+
+
 def by_seed(rows: Sequence[Row], task: str, method: str) -> dict[float, dict[float, float]]:
-    """The returns of a method on a task: for each seed, by updates."""
+    """The values of a method on a task: for each seed, by place."""
     seeds: dict[float, dict[float, float]] = {}
     for row in rows:
         if (row["task"], row["method"]) == (task, method):
-            seeds.setdefault(row["seed"], {})[row["updates"]] = row["return_mean"]
+            seeds.setdefault(row["seed"], {})[row["x"]] = row["value"]
     return seeds
 
 
-def compared_at(rows: Sequence[Row], task: str, updates: float | None) -> float:
-    """The updates at which a task's methods are compared."""
-    runs = [run for m in names(rows, "method") for run in by_seed(rows, task, m).values()]
-    return shared(runs)[-1] if updates is None else updates
+def last_shared(rows: Sequence[Row], task: str) -> float:
+    """The last place at which all runs of a task were evaluated."""
+    return shared([run for m in names(rows, "method") for run in by_seed(rows, task, m).values()])[
+        -1
+    ]
 
 
-def returns(rows: Sequence[Row], task: str, method: str, updates: float) -> np.ndarray:
-    """The return of each seed that was evaluated at `updates`."""
+def values_at(rows: Sequence[Row], task: str, method: str, place: float) -> np.ndarray:
+    """The value of each seed that was evaluated at a place."""
     runs = by_seed(rows, task, method).values()
-    return np.array([run[updates] for run in runs if updates in run])
+    return np.array([run[place] for run in runs if place in run])
 
 
-def scores(rows: Sequence[Row], updates: float | None) -> tuple[list[str], Scores]:
+def before_training(rows: Sequence[Row], task: str) -> float:
+    """The mean over all runs of a task of their first evaluation."""
+    first = {}
+    for row in rows:
+        if row["task"] == task:
+            first.setdefault((row["method"], row["seed"]), row["value"])
+    return float(np.mean(list(first.values())))
+
+
+def scores(rows: Sequence[Row], place: float | None) -> tuple[list[str], Scores]:
     """Scores of the methods on the tasks that all of them have, and these tasks.
 
     A task on which no method is better than before training has no scale, and is left out.
     """
     methods, tasks, found = names(rows, "method"), [], {}
     for task in names(rows, "task"):
-        at = compared_at(rows, task, updates)
-        each = [returns(rows, task, method, at) for method in methods]
-        first = np.concatenate([returns(rows, task, method, 0.0) for method in methods]).mean()
+        at = last_shared(rows, task) if place is None else place
+        each = [values_at(rows, task, method, at) for method in methods]
+        first = before_training(rows, task)
         if not all(map(len, each)) or (best := max(map(np.mean, each))) <= first:
             continue
         tasks.append(task)

@@ -14,7 +14,6 @@ directory, or of all below a folder.
 from __future__ import annotations
 
 import argparse
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -25,7 +24,8 @@ from typing import Any
 from matplotlib.axes import Axes
 from omegaconf import OmegaConf
 
-from curves import draw_mean, make_panels, shared
+from curves import draw_marks, draw_mean, make_panels, shared
+from evaluations import read_evaluations
 
 OWN_KEYS = ("seed", "run_dir", "resume", "logger", "checkpoint", "video")  # not what a run is
 
@@ -40,12 +40,8 @@ class Run:
 
     @classmethod
     def read(cls, run_dir: Path) -> Run:
-        config = OmegaConf.to_container(OmegaConf.load(run_dir / "config.yaml"))
-        with open(run_dir / "eval.csv", newline="") as file:
-            rows = [{k: float(v) for k, v in row.items()} for row in csv.DictReader(file)]
-        for row in rows:
-            row["updates"] += row.get("offline_updates", 0) - rows[-1].get("offline_updates", 0)
-        return cls(run_dir, config, rows)
+        config, rows = read_evaluations(run_dir)
+        return cls(run_dir, OmegaConf.to_container(config), rows)
 
     @property
     def settings(self) -> str:
@@ -159,18 +155,13 @@ def main() -> None:
 
     curves = make_curves([run for folder in arguments.run_dirs for run in runs_in(folder)])
     tasks = sorted({curve.runs[0].task for curve in curves})
+    lines = {name: float(value) for name, value in (text.split("=") for text in arguments.line)}
     xlabel = unit(curves) if arguments.x == "updates" else "environment frames"
     figure, panels = make_panels(tasks, xlabel)
     for curve, label in zip(curves, labels(curves), strict=True):
         draw(panels[curve.runs[0].task], curve, label, arguments.x)
     for axes in panels.values():
-        if axes.dataLim.x0 < 0:
-            axes.axvline(
-                0, color="0.4", linestyle=":", linewidth=1, label="end of the offline phase"
-            )
-        for text in arguments.line:
-            name, value = text.split("=")
-            axes.axhline(float(value), color="0.4", linestyle="--", linewidth=1, label=name)
+        draw_marks(axes, lines)
         axes.legend(frameon=False)
     figure.savefig(arguments.output, dpi=150)
     for task in tasks:

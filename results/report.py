@@ -1,22 +1,24 @@
 """Numbers and figures of a study, from the directories of its runs or from its CSV.
 
     python results/report.py runs/studies/table2 results/table2
-    python results/report.py results/table2/evaluations.csv results/table2 --updates 100000
+    python results/report.py results/table2/evaluations.csv results/table2 --at 50000 100000
+    python results/report.py runs/studies/offline_to_online OUT --x frames --value normalized_score
 
 Writes one tidy CSV with every evaluation, a card with the tables, and a figure for each question:
 how fast (curves.png), how good over all tasks (aggregate.png), how many runs are how good
-(profiles.png), is one method better than another (improvement.png). Needs SciPy and the `recipes`
-extra.
+(profiles.png), is one method better than another (improvement.png). What stands below "## Notes" in
+an old card is kept. Needs SciPy and the `recipes` extra.
 
-Scores are returns on a scale of each task: 0 is the mean return before training, 1 the best mean of
-a method in this study. Methods are compared at the same updates: on each task the last at which all
-its runs were evaluated, or `--updates`.
+Scores are values on a scale of each task: 0 is the mean before training, 1 the best mean of a
+method in this study. Methods are compared at the same updates or frames: on each task the last at
+which all its runs were evaluated, or `--at`, the last of which the scores are of.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -24,18 +26,19 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from curves import draw_mean, make_panels
+from curves import draw_marks, draw_mean, make_panels
 from evaluations import (
     COLUMNS,
     Row,
     Scores,
     by_seed,
-    compared_at,
+    last_shared,
     names,
     read_csv,
-    read_runs,
-    returns,
+    read_study,
     scores,
+    values_at,
+    viewed,
 )
 from intervals import (
     interquartile_mean,
@@ -46,6 +49,7 @@ from intervals import (
 )
 
 PAPER = Path(__file__).parent / "paper.csv"
+Lines = dict[str, dict[str, float]]  # of each task: names and values
 
 
 # --- tables ---------------------------------------------------------------------------------------
@@ -80,48 +84,78 @@ def cell(values: np.ndarray) -> str:
     return f"{number(values.mean())}{band} (n={len(values)})"
 
 
-def task_table(rows: Sequence[Row], updates: float | None) -> str:
-    """The paper's table: tasks by methods, and the paper's own numbers at the same updates."""
-    methods, paper, lines = names(rows, "method"), read_csv(PAPER), []
+def task_table(rows: Sequence[Row], places: Sequence[float], unit: str) -> str:
+    """The paper's table: tasks by methods at some places, the last shared one where none is given.
+
+    The paper's own numbers stand below those at the same updates.
+    """
+    methods, lines = names(rows, "method"), []
     for task in names(rows, "task"):
-        at = compared_at(rows, task, updates)
-        values = [cell(returns(rows, task, method, at)) for method in methods]
-        lines.append([f"{task}, {at:,.0f} updates", *values])
-        told = {
-            row["method"]: f"{number(row['return_mean'])} ± {number(row['half_width'])}"
-            for row in paper
-            if (row["task"], row["updates"]) == (task, at)
-        }
-        if told:
-            lines.append(["*paper*", *(told.get(method, "") for method in methods)])
+        for place in places or [last_shared(rows, task)]:
+            values = [cell(values_at(rows, task, method, place)) for method in methods]
+            if not any(values):
+                continue
+            lines.append([f"{task}, {place:,.0f} {unit}", *values])
+            if told := paper(task, place) if unit == "updates" else {}:
+                lines.append(["*paper*", *(told.get(method, "") for method in methods)])
     return markdown(["", *methods], lines)
 
 
+def paper(task: str, updates: float) -> dict[str, str]:
+    """What the paper's table 2 says of each method."""
+    return {
+        row["method"]: f"{number(row['return_mean'])} ± {number(row['half_width'])}"
+        for row in read_csv(PAPER)
+        if (row["task"], row["updates"]) == (task, updates)
+    }
+
+
+def runs_table(rows: Sequence[Row]) -> str:
+    """A row for each run: how far it came, what it took, and the version that made it."""
+    last = {(row["task"], row["method"], row["seed"]): row for row in rows}
+    first = {
+        key: row for row in reversed(rows) if (key := (row["task"], row["method"], row["seed"]))
+    }
+    lines = []
+    for key, row in last.items():
+        offline = max(0, -first[key]["updates"])
+        updates = f"{offline:,.0f} + {row['updates']:,.0f}" if offline else f"{row['updates']:,.0f}"
+        minutes = f"{row['seconds'] / 60:.0f}" if row["seconds"] != "" else ""
+        made = f"{row['return_mean']:.0f} ± {row['return_std']:.0f}"
+        counts = [f"{row['seed']:.0f}", updates, f"{row['frames']:,.0f}", made, minutes]
+        lines.append([row["task"], row["method"], *counts, row["commit"][:7]])
+    header = ["task", "method", "seed", "updates", "frames", "return", "minutes", "commit"]
+    return markdown(header, lines)
+
+
 def aggregate_table(rows: Sequence[Row], found: Scores) -> str:
-    """Interquartile mean and mean over all tasks, and the speed."""
+    """Interquartile mean and mean over all tasks, speed and size."""
     lines = []
     for method, tasks in found.items():
         cells = [
             ranged(float(statistic(*tasks)), interval(statistic, tasks))
             for statistic in (interquartile_mean, mean)
         ]
-        speeds = [row["updates_per_second"] for row in rows if row["method"] == method]
-        known = [speed for speed in speeds if speed != ""]
-        lines.append([method, *cells, f"{np.median(known):.2f}" if known else ""])
-    return markdown(["method", "interquartile mean", "mean", "updates/s"], lines)
+        own = [row for row in rows if row["method"] == method]
+        speeds = [row["updates_per_second"] for row in own if row["updates_per_second"] != ""]
+        sizes = sorted({int(row["parameters"]) for row in own if row["parameters"] != ""})
+        size = " to ".join(f"{n:,}" for n in dict.fromkeys([*sizes[:1], *sizes[-1:]]))
+        lines.append([method, *cells, f"{np.median(speeds):.2f}" if speeds else "", size])
+    return markdown(["method", "interquartile mean", "mean", "updates/s", "parameters"], lines)
 
 
 # --- figures --------------------------------------------------------------------------------------
 
 
-def draw_curves(rows: Sequence[Row], path: Path) -> None:
+def draw_curves(rows: Sequence[Row], path: Path, labels: tuple[str, str], lines: Lines) -> None:
     """A panel for each task: the mean over seeds and its interval."""
-    figure, panels = make_panels(names(rows, "task"), "updates")
+    figure, panels = make_panels(names(rows, "task"), *labels)
     for task, axes in panels.items():
         for method in names(rows, "method"):
             if runs := list(by_seed(rows, task, method).values()):
                 draw_mean(axes, f"{method}, n={len(runs)}", runs)
-        axes.legend(frameon=False)
+        draw_marks(axes, lines.get(task, {}))
+        axes.legend(frameon=False, fontsize="small")
     figure.savefig(path, dpi=120)
 
 
@@ -163,26 +197,58 @@ def draw_profiles(found: Scores, path: Path) -> None:
 # --- the report -----------------------------------------------------------------------------------
 
 
-def write_report(rows: Sequence[Row], out: Path, updates: float | None) -> str:
+def write_report(rows: Sequence[Row], out: Path, args: argparse.Namespace) -> str:
     """Writes the CSV, the figures and the card, and returns the card."""
     out.mkdir(parents=True, exist_ok=True)
     with open(out / "evaluations.csv", "w", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS)
         writer.writeheader()
         writer.writerows(rows)
-    draw_curves(rows, out / "curves.png")
+    runs = runs_table(rows)
+    rows = viewed(rows, args.x, args.value)
+    named = {"return_mean": "mean return", "normalized_score": "normalised score"}[args.value]
+    draw_curves(rows, out / "curves.png", (args.x, named), parse_lines(args.line))
     parts = [
         f"# {out.name}\n",
-        "Mean return and 95 % bootstrap interval over n seeds; the paper's ± is a 95 % interval.\n",
-        task_table(rows, updates),
+        f"{named.capitalize()} and 95 % bootstrap interval over n seeds; the paper's ± is a 95 % "
+        "interval.\n",
+        task_table(rows, args.at, args.x),
         "\n![curves](curves.png)",
     ]
-    tasks, found = scores(rows, updates)
+    tasks, found = scores(rows, args.at[-1] if args.at else None)
     if found:
         parts += [aggregates(rows, tasks, found, out)]
-    card = "\n".join(parts) + "\n"
+    parts += ["\n## Runs\n", runs, f"\nTables and figures again: `{command(out, args)}`\n"]
+    card = "\n".join([*parts, notes(out / "card.md")])
     (out / "card.md").write_text(card)
     return card
+
+
+def command(out: Path, args: argparse.Namespace) -> str:
+    """The command that makes a report anew from its CSV."""
+    words = ["python", "results/report.py", str(out / "evaluations.csv"), str(out)]
+    words += ["--x", args.x] * (args.x != "updates")
+    words += ["--value", args.value] * (args.value != "return_mean")
+    words += ["--at", *(f"{place:g}" for place in args.at)] * bool(args.at)
+    words += [word for line in args.line for word in ("--line", line)]
+    return shlex.join(words)
+
+
+def notes(card: Path) -> str:
+    """What somebody has written below a card, from its heading on."""
+    text = card.read_text() if card.exists() else ""
+    _, heading, rest = text.partition("\n## Notes\n")
+    return heading + rest
+
+
+def parse_lines(texts: Sequence[str]) -> Lines:
+    """What `--line TASK:NAME=VALUE` says, by task."""
+    lines: Lines = {}
+    for text in texts:
+        task, _, rest = text.partition(":")
+        name, _, value = rest.partition("=")
+        lines.setdefault(task, {})[name] = float(value)
+    return lines
 
 
 def aggregates(rows: Sequence[Row], tasks: Sequence[str], found: Scores, out: Path) -> str:
@@ -211,11 +277,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("study", type=Path, help="a folder of runs, or an evaluations.csv")
     parser.add_argument("out", type=Path, help="the folder of the report")
-    parser.add_argument("--updates", type=float, help="where to compare")
+    parser.add_argument("--x", choices=("updates", "frames"), default="updates")
+    parser.add_argument(
+        "--value", choices=("return_mean", "normalized_score"), default="return_mean"
+    )
+    parser.add_argument("--at", type=float, nargs="+", default=[], help="where to compare")
+    parser.add_argument("--line", action="append", default=[], help="TASK:NAME=VALUE, drawn dashed")
     arguments = parser.parse_args()
-    study = arguments.study
-    rows = read_csv(study) if study.suffix == ".csv" else read_runs(study)
-    print(write_report(rows, arguments.out, arguments.updates))
+    print(write_report(read_study(arguments.study), arguments.out, arguments))
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -60,7 +61,10 @@ def write_run(folder: Path, method: str, seed: int, returns: dict[int, float], t
         writer = csv.writer(file)
         writer.writerow(["updates", "frames", "return_mean", "return_std", "num_episodes"])
         writer.writerows([u, 5 * u, value, 1.0, 10] for u, value in returns.items())
-    (run_dir / "metrics.csv").write_text("updates,updates_per_second\n1,2.0\n2,4.0\n3,3.0\n")
+    metrics = "updates,seconds,updates_per_second\n1,60,2.0\n50000,120,4.0\n60000,180,3.0\n"
+    (run_dir / "metrics.csv").write_text(metrics)
+    versions = {"parameters": 475746, "commit": "0123456789abcdef"}
+    (run_dir / "versions.json").write_text(json.dumps(versions))
 
 
 @pytest.fixture
@@ -81,9 +85,11 @@ def test_a_report_has_the_paper_beside_and_its_csv_makes_it_again(study, tmp_pat
         printed = subprocess.run(call, capture_output=True, text=True, check=True).stdout
         assert "| Hopper-v4, 100,000 updates | 2100 [2000, 2200] (n=2) | 1010 [" in printed
         assert "| *paper* | 2960 ± 312 |  |" in printed
-        assert "| aca | 1.00 [0.95, 1.05] | 1.00 [0.95, 1.05] | 3.00 |" in printed
+        assert "| aca | 1.00 [0.95, 1.05] | 1.00 [0.95, 1.05] | 3.00 | 475,746 |" in printed
+        assert "| Hopper-v4 | aca | 1 | 100,000 | 500,000 | 2200 ± 1 | 3 | 0123456 |" in printed
+    found = {path.name for path in (tmp_path / "a").iterdir()}
     names = {"evaluations.csv", "card.md", "curves.png", "aggregate.png", "profiles.png"}
-    assert {path.name for path in (tmp_path / "a").iterdir()} == {*names, "improvement.png"}
+    assert found == {*names, "improvement.png"}
     first, second = ((tmp_path / out / "evaluations.csv").read_text() for out in "ab")
     assert [line.split(",")[:2] for line in first.splitlines()] == [
         line.split(",")[:2] for line in second.splitlines()
@@ -91,8 +97,36 @@ def test_a_report_has_the_paper_beside_and_its_csv_makes_it_again(study, tmp_pat
     assert len(first.splitlines()) == 1 + 2 * 2 + 2 * 3
 
 
+def rows_of(study: Path) -> list[dict]:
+    return evaluations.viewed(evaluations.read_study(study), "updates", "return_mean")
+
+
+def test_an_offline_phase_is_below_zero_and_at_no_frame(tmp_path):
+    study = tmp_path / "data"
+    write_run(study, "iql", 0, {0: 0})
+    spec = {"name": "data", "tasks": {"Hopper-v4": []}, "methods": {"iql": []}}
+    OmegaConf.save(spec, study / "study.yaml")
+    run_dir = study / "Hopper-v4-iql-s0"
+    (run_dir / "eval.csv").write_text(
+        "updates,frames,offline_updates,return_mean,return_std,num_episodes,normalized_score\n"
+        "0,0,0,5,1,10,0.5\n0,0,40,50,1,10,5\n20,60,40,100,1,10,10\n"
+    )
+    (run_dir / "metrics.csv").write_text(
+        "updates,offline_updates,seconds,updates_per_second\n0,40,8,5\n20,40,30,1\n"
+    )
+    rows = evaluations.read_study(study)
+    assert [(row["updates"], row["seconds"]) for row in rows] == [(-40, 0.0), (0, 8.0), (20, 30.0)]
+    options = ["--x", "frames", "--value", "normalized_score", "--at", "0", "60"]
+    line = ["--line", "Hopper-v4:data=7.5"]
+    call = [sys.executable, str(SCRIPT), str(study), str(tmp_path / "out"), *options, *line]
+    printed = subprocess.run(call, capture_output=True, text=True, check=True).stdout
+    assert "Normalised score and 95 %" in printed
+    assert "| Hopper-v4, 0 frames | 5.0 (n=1) |\n| Hopper-v4, 60 frames | 10.0 (n=1) |" in printed
+    assert "| Hopper-v4 | iql | 0 | 40 + 20 | 60 | 100 ± 1 | 0 | 0123456 |" in printed
+
+
 def test_scores_are_on_the_scale_of_their_task(study):
-    tasks, found = evaluations.scores(evaluations.read_runs(study), None)
+    tasks, found = evaluations.scores(rows_of(study), None)
     assert tasks == ["Hopper-v4"]
     assert np.allclose(found["aca"][0], [1990 / 2090, 2190 / 2090])
     assert np.allclose(found["narrow"][0], [990 / 2090, 1010 / 2090])
@@ -101,10 +135,10 @@ def test_scores_are_on_the_scale_of_their_task(study):
 def test_a_task_on_which_nothing_was_learned_has_no_scale(study):
     for method in ("aca", "narrow"):
         write_run(study, method, 0, {0: 5, 100000: 4}, task="Ant-v4")
-    tasks, _ = evaluations.scores(evaluations.read_runs(study), None)
+    tasks, _ = evaluations.scores(rows_of(study), None)
     assert tasks == ["Hopper-v4"]
 
 
 def test_a_folder_without_runs_is_told(tmp_path):
     with pytest.raises(SystemExit, match="expected directories of runs that have begun"):
-        evaluations.read_runs(tmp_path)
+        evaluations.read_study(tmp_path)

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
+from torch import nn
 
 from torchrl_aca.replay import transitions
 from torchrl_aca.training.policy import PolicyBuilder
@@ -61,6 +62,13 @@ class Agent:
     offline_rows: Rows | None = None
     rewrites: Mapping[NestedKey, NestedKey] = field(default_factory=dict)
     policy_builder: PolicyBuilder | None = None
+
+    @property
+    def num_parameters(self) -> int:
+        """How many parameters are trained, temperatures left out, as the papers count."""
+        modules = (part for part in self.state.values() if isinstance(part, nn.Module))
+        parameters = (p for module in modules for p in module.parameters())
+        return sum(p.numel() for p in parameters if p.requires_grad and p.ndim)
 
     def rows_of(self, data: TensorDictBase) -> TensorDictBase:
         """Returns what of collected data goes to the replay buffer."""

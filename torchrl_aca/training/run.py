@@ -168,7 +168,8 @@ class Run:
         if resumed:
             require_newest(self.dir, counters.total)
         else:
-            write_text(self.dir / "versions.json", json.dumps(versions(), indent=2) + "\n")
+            made_with = versions() | {"parameters": self.agent.num_parameters}
+            write_text(self.dir / "versions.json", json.dumps(made_with, indent=2) + "\n")
         # The run as it is now: a resume may have changed the number of updates or the logger.
         self.config = {**cfg.model_dump(), "resume": None}
         write_text(self.dir / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(self.config)))
