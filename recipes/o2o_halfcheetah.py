@@ -15,18 +15,17 @@ online one. `pretrained=RUN_DIR` takes the first from another run. Every key is 
 from __future__ import annotations
 
 from collections.abc import Callable
-from fractions import Fraction
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import hydra
 from omegaconf import DictConfig
-from pydantic import Field, model_validator
 
 import help_text  # noqa: F401
 import renderer  # noqa: F401
-from agents import AGENTS, configured, make_agent
+from agents import configured, make_agent
 from agents.pretrained import require_offline_phase, start_from
+from data.config import OfflineToOnlineConfig
 from data.offline import (
     generate_missing,
     load_offline_data,
@@ -35,7 +34,6 @@ from data.offline import (
     task_scores,
 )
 from torchrl_aca.offline.scores import normalized_score
-from torchrl_aca.training.config import Count, RunConfig, Share, is_number
 from torchrl_aca.training.envs import make_vector_env
 from torchrl_aca.training.evaluation import evaluate, make_eval_env, report_extras
 from torchrl_aca.training.launch import launch, make_device
@@ -43,34 +41,6 @@ from torchrl_aca.training.logging import require_wandb_login
 from torchrl_aca.training.randomness import seed_everything
 from torchrl_aca.training.run import Run
 from torchrl_aca.training.workers import make_collection
-
-
-class OfflineToOnlineConfig(RunConfig):
-    """`o2o_halfcheetah.yaml`."""
-
-    dataset: str | None
-    generate: dict[str, Any] | None
-    offline_updates: Annotated[int, Field(ge=0, le=10**12)]
-    pretrained: str | None
-    offline_fraction: Share
-    utd: Annotated[float, Field(ge=1e-4, le=1e4)]
-    online_frames: Count
-
-    @model_validator(mode="after")
-    def _method(self) -> OfflineToOnlineConfig:
-        if not AGENTS[self.algo.name].mixes:
-            able = sorted(name for name, method in AGENTS.items() if method.mixes)
-            self.refuse("algo.name", f"one of {able}, as it changes the rows of its buffer")
-        return self
-
-    @model_validator(mode="before")
-    @classmethod
-    def _length(cls, values: dict[str, Any]) -> dict[str, Any]:
-        """`optim.total_updates: null` means as many as the online frames call for."""
-        ratio, frames = values.get("utd"), values.get("online_frames")
-        if values["optim"]["total_updates"] is None and is_number(ratio) and is_number(frames):
-            values["optim"]["total_updates"] = int(frames * Fraction(str(ratio)))
-        return values
 
 
 def train(cfg: DictConfig, checkpoint: dict[str, Any] | None = None) -> Path:

@@ -5,8 +5,9 @@
     python recipes/study.py study=table2 launcher=submitit
     python recipes/study.py study=table2 launcher=ray
 
-Each run is a directory below `runs/studies/<name>`, made by `online_mujoco.py`. The same command
-again skips the finished ones and goes on with the others. Every key is in `configs/study.yaml`.
+Each run is a directory below `runs/studies/<name>`, made by the recipe that the study names. The
+same command again skips the finished ones and goes on with the others. Every key is in
+`configs/study.yaml`.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ def run(cfg: StudyConfig) -> int:
         print(status_table(jobs))
         return 0
     write_study(cfg)
-    open_jobs = [job for job in jobs if state_of(job).name in ("stopped", "left")]
+    open_jobs = [job for job in jobs if state_of(job).name not in ("done", "running")]
     print(f"{study_dir(cfg)}: {len(open_jobs)} of {len(jobs)} jobs to do", flush=True)
     failed = 0
     with StopSignal() as stop:

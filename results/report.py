@@ -87,7 +87,8 @@ def cell(values: np.ndarray) -> str:
 def task_table(rows: Sequence[Row], places: Sequence[float], unit: str) -> str:
     """The paper's table: tasks by methods at some places, the last shared one where none is given.
 
-    The paper's own numbers stand below those at the same updates.
+    The paper's own numbers stand below those at the same updates. What follows an underscore in a
+    method's name is a variant: `aca_n4` stands above the paper's `aca`.
     """
     methods, lines = names(rows, "method"), []
     for task in names(rows, "task"):
@@ -97,7 +98,11 @@ def task_table(rows: Sequence[Row], places: Sequence[float], unit: str) -> str:
                 continue
             lines.append([f"{task}, {place:,.0f} {unit}", *values])
             if told := paper(task, place) if unit == "updates" else {}:
-                lines.append(["*paper*", *(told.get(method, "") for method in methods)])
+                beside = [
+                    told.get(m.split("_")[0], "") * bool(v)
+                    for m, v in zip(methods, values, strict=True)
+                ]
+                lines.append(["*paper*", *beside])
     return markdown(["", *methods], lines)
 
 
@@ -216,10 +221,10 @@ def write_report(rows: Sequence[Row], out: Path, args: argparse.Namespace) -> st
         "\n![curves](curves.png)",
     ]
     tasks, found = scores(rows, args.at[-1] if args.at else None)
-    if found:
+    if len(found) > 1:
         parts += [aggregates(rows, tasks, found, out)]
-    parts += ["\n## Runs\n", runs, f"\nTables and figures again: `{command(out, args)}`\n"]
-    card = "\n".join([*parts, notes(out / "card.md")])
+    parts += ["\n## Runs\n", runs, f"\nTables and figures again: `{command(out, args)}`"]
+    card = "\n".join(parts) + "\n" + notes(out / "card.md")
     (out / "card.md").write_text(card)
     return card
 

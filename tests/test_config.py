@@ -7,7 +7,7 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
 from agents import AGENTS, configured
-from o2o_halfcheetah import OfflineToOnlineConfig
+from data.config import OfflineToOnlineConfig
 from online_mujoco import train
 from recipe_cases import CONFIGS, composed, run
 from torchrl_aca.errors import RunError

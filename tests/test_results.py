@@ -1,4 +1,4 @@
-"""Promises of results/plot.py and of the tables in results/runs.md that it printed."""
+"""Promises of results/plot.py, and of the cards that results/report.py wrote."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import csv
 import importlib.util
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -15,7 +16,7 @@ from matplotlib.figure import Figure
 from omegaconf import OmegaConf
 
 RESULTS = Path(__file__).parents[1] / "results"
-PLOTS = re.findall(r"`python (results/plot\.py results/[^`]+)`", (RESULTS / "runs.md").read_text())
+CARDS = sorted(path.with_name("card.md") for path in RESULTS.glob("*/evaluations.csv"))
 
 
 @pytest.fixture(scope="module")
@@ -121,13 +122,15 @@ def test_a_folder_stands_for_the_runs_in_it_and_one_without_is_told(plot, tmp_pa
         plot.runs_in(tmp_path / "empty")
 
 
-def test_the_page_has_tables_that_a_command_prints():
-    assert len(PLOTS) == 2
-
-
-@pytest.mark.parametrize("command", PLOTS)
-def test_tables_in_the_page_are_what_the_command_prints(plot, command):
-    _, _, *arguments = shlex.split(command)
-    named = [a for a in arguments if a.startswith("results/")]
-    run_dirs = [path for name in named for path in sorted(RESULTS.parent.glob(name))]
-    assert plot.table(plot.make_curves(run_dirs)) in (RESULTS / "runs.md").read_text()
+@pytest.mark.parametrize("card", CARDS, ids=lambda card: card.parent.name)
+def test_cards_are_what_their_command_prints(card, tmp_path):
+    text = card.read_text()
+    again = re.search(r"again: `python results/report\.py (.+)`", text)
+    source, out, *options = shlex.split(again[1])
+    shutil.copytree(card.parent, copy := tmp_path / card.parent.name)
+    command = [sys.executable, str(RESULTS / "report.py"), str(RESULTS.parent / source), str(copy)]
+    subprocess.run([*command, *options], check=True, capture_output=True)
+    written = (copy / "card.md").read_text().replace(str(copy), out)
+    assert written == text
+    assert (copy / "evaluations.csv").read_text() == (card.parent / "evaluations.csv").read_text()
+    assert "## Notes" in text

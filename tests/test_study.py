@@ -18,6 +18,7 @@ from studies.status import State, left_seconds, state_of, summary
 from torchrl_aca.errors import RunError
 from torchrl_aca.training.config import checked
 from torchrl_aca.training.run_dir import lock
+from torchrl_aca.training.signals import STOPPED
 
 
 @pytest.fixture
@@ -45,7 +46,7 @@ def test_a_study_of_the_other_recipe_has_its_keys(study):
     job = study("study=offline_to_online", "dir=/s")[-1]
     assert job.command[1].endswith("o2o_halfcheetah.py")
     assert job.dir.name == "HalfCheetah-v4-random-calql-s1"
-    assert (job.config.offline_updates, job.config.optim.total_updates) == (5000, 5000)
+    assert (job.config.offline_updates, job.updates) == (5000, 10000)
     with pytest.raises(RunError, match="recipe='bandit_2d': expected"):
         study("study=tiny", "+study.recipe=bandit_2d")
 
@@ -110,8 +111,11 @@ def test_states_and_expected_time_are_read_from_the_directories(study, tmp_path)
     assert states[0].latest == 7.5
     # 2000 updates of the second job, 2000 of the third, 3000 of the fourth
     assert left_seconds(jobs, states) == pytest.approx(2000 * 0.2 + 2000 * 0.1 + 3000 * 0.1)
-    text = "1 done, 1 running, 1 stopped, 1 left; work left: 0:15:00; 0:15:00 at 1 at once"
-    assert summary(jobs, states) == text
+    text = "work left: 0:15:00; 0:15:00 at 1 at once"
+    assert summary(jobs, states) == f"1 done, 1 running, 1 stopped, 0 failed, 1 left; {text}"
+    for code, name in ((-9, "failed"), (1, "failed"), (STOPPED, "stopped")):
+        jobs[2].exit_status.write_text(f"{code}\n")
+        assert state_of(jobs[2]).name == name
 
 
 def write_study(folder: Path) -> None:
@@ -156,7 +160,7 @@ def test_killed_and_bad_jobs_are_told_the_others_go_on_and_the_same_command_goes
     assert "Reacher-v4-one-s0 failed with status -9" in output
     assert "Reacher-v4-two-s0 done" in output
     assert "Reacher-v4-bad-s0 failed with status 1: error: env.name='Nowhere-v0'" in output
-    assert "1 done, 0 running, 2 stopped, 0 left" in output
+    assert "1 done, 0 running, 0 stopped, 2 failed, 0 left" in output
 
     evaluated = (two / "eval.csv").stat().st_mtime
     _, output, _ = run(*command, cwd=tmp_path, recipe="study")

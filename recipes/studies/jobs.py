@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 from pydantic import Field
 
 from agents import configured
-from o2o_halfcheetah import OfflineToOnlineConfig
+from data.config import OfflineToOnlineConfig
 from torchrl_aca.errors import RunError
 from torchrl_aca.training.config import Count, RunConfig, Section, Seed
 
@@ -94,9 +94,19 @@ class Job:
         return [sys.executable, str(self.script), *self.overrides]
 
     @property
+    def updates(self) -> int:
+        """How many it makes, those of an offline phase included."""
+        return self.config.optim.offline_updates + self.config.optim.total_updates
+
+    @property
     def output(self) -> Path:
         """Where the command's output goes."""
         return self.dir / "output.txt"
+
+    @property
+    def exit_status(self) -> Path:
+        """Where the command's exit status is once it has ended."""
+        return self.dir / "exit_status"
 
 
 def study_dir(cfg: StudyConfig) -> Path:

@@ -41,14 +41,17 @@ def run_job(job: Job, threads: int, stop: StopSignal | None = None) -> int:
     if stop.received:
         return STOPPED
     job.dir.mkdir(parents=True, exist_ok=True)
+    job.exit_status.unlink(missing_ok=True)
     with open(job.output, "a") as output:
-        return run_command(
+        code = run_command(
             job.command,
             stop,
             stdout=output,
             stderr=subprocess.STDOUT,
             env={**os.environ, "OMP_NUM_THREADS": str(threads)},
         )
+    job.exit_status.write_text(f"{code}\n")
+    return code
 
 
 def run_local(settings: Local, jobs: Sequence[Job], threads: int, stop: StopSignal) -> Results:

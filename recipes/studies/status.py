@@ -12,6 +12,9 @@ from statistics import fmean
 from studies.jobs import Job
 from torchrl_aca.training.resume import is_finished, read_evaluations
 from torchrl_aca.training.run_dir import is_locked
+from torchrl_aca.training.signals import STOPPED
+
+NAMES = ("done", "running", "stopped", "failed", "left")
 
 
 @dataclass(frozen=True)
@@ -19,8 +22,9 @@ class State:
     """Where a job is.
 
     Attributes:
-        name: "done", "running", "stopped" (told to stop, killed or failed) or "left" (not begun).
-        updates: Made, as far as its table has them.
+        name: One of `NAMES`: "failed" by itself or was killed; "stopped" was told to, or lost the
+            study's own process; "left" has not begun.
+        updates: Made in all phases, as far as its table has them.
         seconds: What they took; 0 where nothing is known.
         latest: The latest evaluation return, or None.
     """
@@ -36,9 +40,11 @@ def state_of(job: Job) -> State:
     updates, seconds = _progress(job)
     returns = [row["return_mean"] for row in read_evaluations(job.dir)]
     if is_finished(job.dir, job.config):
-        name, updates = "done", job.config.optim.total_updates
+        name, updates = "done", job.updates
     elif is_locked(job.dir):
         name = "running"
+    elif has_failed(job):
+        name = "failed"
     else:
         name = "stopped" if job.dir.exists() else "left"
     return State(name, updates, seconds, returns[-1] if returns else None)
@@ -51,7 +57,16 @@ def _progress(job: Job) -> tuple[int, float]:
         return 0, 0.0
     with open(path, newline="") as file:
         rows = [row for row in csv.DictReader(file) if row.get("updates_per_second")]  # whole rows
-    return (int(rows[-1]["updates"]), float(rows[-1]["seconds"])) if rows else (0, 0.0)
+    if not rows:
+        return 0, 0.0
+    updates = int(rows[-1]["updates"]) + int(rows[-1].get("offline_updates") or 0)
+    return updates, float(rows[-1]["seconds"])
+
+
+def has_failed(job: Job) -> bool:
+    """Whether the job's latest command has ended in another way than it was asked to."""
+    path = job.exit_status
+    return path.exists() and int(path.read_text()) not in (0, STOPPED)
 
 
 def last_line(job: Job) -> str:
@@ -66,9 +81,9 @@ def status_table(jobs: Sequence[Job]) -> str:
     width = max(len(job.dir.name) for job in jobs)
     lines = []
     for job, state in zip(jobs, states, strict=True):
-        made = f"{state.updates:,}/{job.config.optim.total_updates:,}"
+        made = f"{state.updates:,}/{job.updates:,}"
         value = "" if state.latest is None else f"return {state.latest:.1f}"
-        why = last_line(job) if state.name == "stopped" else ""
+        why = last_line(job) if state.name in ("stopped", "failed") else ""
         lines.append(
             f"{job.dir.name:<{width}}  {state.name:<8}{made:>20}  {value:<16}{why}".rstrip()
         )
@@ -78,7 +93,7 @@ def status_table(jobs: Sequence[Job]) -> str:
 def summary(jobs: Sequence[Job], states: Sequence[State]) -> str:
     """How many jobs are where, and how long what is left would take one after the other."""
     counts = Counter(state.name for state in states)
-    numbers = ", ".join(f"{counts[name]} {name}" for name in ("done", "running", "stopped", "left"))
+    numbers = ", ".join(f"{counts[name]} {name}" for name in NAMES)
     seconds = left_seconds(jobs, states)
     if seconds is None:
         return f"{numbers}; the time of a method without updates so far is unknown"
@@ -96,7 +111,7 @@ def left_seconds(jobs: Sequence[Job], states: Sequence[State]) -> float | None:
             paces.setdefault(job.method, []).append(state.seconds / state.updates)
     total = 0.0
     for job, state in zip(jobs, states, strict=True):
-        updates = job.config.optim.total_updates - state.updates
+        updates = job.updates - state.updates
         if updates and job.method not in paces:
             return None
         total += updates * fmean(paces.get(job.method, [0.0]))
