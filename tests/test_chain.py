@@ -181,12 +181,16 @@ def test_draws_must_fit_the_number_of_steps():
 # --- Langevin -------------------------------------------------------------------------------------
 
 
+def no_gradient(action, level):
+    return torch.zeros_like(action)
+
+
 @pytest.mark.parametrize("sizes", [0.04, [0.5, 0.25, 0.125]])
 @pytest.mark.parametrize("clip", [False, True, 0.5])
 def test_langevin_equals_numpy_for_a_constant_and_for_scheduled_steps(sizes, clip):
     noise, weight = draws(4, N, BATCH, ACTION), 3.0
     path = langevin(
-        lambda a: -a.sin(), noise, sizes, guidance_weight=weight, clip=clip, keep_path=True
+        lambda a, level: -a.sin(), noise, sizes, guidance_weight=weight, clip=clip, keep_path=True
     )
     x = noise[0].numpy()
     for k, eps in enumerate(np.broadcast_to(sizes, 3)):
@@ -194,18 +198,18 @@ def test_langevin_equals_numpy_for_a_constant_and_for_scheduled_steps(sizes, cli
         x = np.clip(x, -float(clip), float(clip)) if clip else x
         np.testing.assert_allclose(path[k + 1], x, rtol=1e-12, atol=1e-12)
     options = {"guidance_weight": weight, "clip": clip}
-    assert torch.equal(langevin(lambda a: -a.sin(), noise, sizes, **options), path[-1])
+    assert torch.equal(langevin(lambda a, level: -a.sin(), noise, sizes, **options), path[-1])
 
 
 def test_langevin_starts_from_scaled_noise():
     noise = draws(3, BATCH, ACTION)
-    path = langevin(torch.zeros_like, noise, 0.1, initial_scale=0.5, keep_path=True)
+    path = langevin(no_gradient, noise, 0.1, initial_scale=0.5, keep_path=True)
     assert torch.equal(path[0], noise[0] / 2)
 
 
 def test_scheduled_steps_must_be_as_many_as_the_draws():
     with pytest.raises(RuntimeError, match="expand"):
-        langevin(torch.zeros_like, draws(4, BATCH, ACTION), [0.1, 0.2])
+        langevin(no_gradient, draws(4, BATCH, ACTION), [0.1, 0.2])
 
 
 # --- gradients ------------------------------------------------------------------------------------
@@ -222,7 +226,7 @@ def test_gradients_flow_through_all_steps(sampler, tile_rows):
             predict = lambda action, level: torch.tanh(parameter * action) * level / T  # noqa: E731
             end = denoise(predict, schedule, noise, clip=5.0, tile_rows=tile_rows)
         else:
-            end = langevin(lambda a: torch.tanh(parameter * a), noise, 0.1, tile_rows=tile_rows)
+            end = langevin(lambda a, _: torch.tanh(parameter * a), noise, 0.1, tile_rows=tile_rows)
         return (end * torch.arange(ACTION)).sum()
 
     parameter = torch.tensor(0.7, dtype=torch.float64, requires_grad=True)

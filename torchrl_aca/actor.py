@@ -285,9 +285,15 @@ class CriticGuidedDenoisingActor(ChainPolicy):
             "run": self._run,
         }
         if self.sampler == "langevin":
-            gradient = partial(self._clean_gradient, features)
-            step_size = self.langevin_step_size
-            return chain.langevin(gradient, noise, step_size, guidance_weight=weight, **how)
+            clean = noise.new_zeros(len(noise) - 1, dtype=torch.long)
+            return chain.langevin(
+                partial(self._gradient, features),
+                noise,
+                self.langevin_step_size,
+                levels=clean,
+                guidance_weight=weight,
+                **how,
+            )
         predict_noise = partial(self._predict_noise, features, weight)
         return chain.denoise(
             predict_noise,
@@ -306,9 +312,6 @@ class CriticGuidedDenoisingActor(ChainPolicy):
         sigma = self.schedule.at(variance, level, action.dtype).sqrt()
         gradient = self._gradient(features, action, level)
         return F.guided_noise(gradient, weight, sigma)
-
-    def _clean_gradient(self, features: Any, action: Tensor) -> Tensor:
-        return self._gradient(features, action, _clean_level(action))
 
     def _gradient(self, features: Any, action: Tensor, level: Tensor) -> Tensor:
         gradient = self.critic.action_gradient(features, action, level)

@@ -140,7 +140,7 @@ def denoise(
 
 
 def langevin(
-    gradient: Callable[..., Tensor],
+    gradient: Callable[[Tensor, Tensor], Tensor],
     noise: Tensor,
     step_size: float | Sequence[float] | Tensor,
     *,
@@ -155,13 +155,13 @@ def langevin(
     """Langevin steps ``a + eps_k/2 w g(a) + sqrt(eps_k) z`` along a gradient.
 
     Args:
-        gradient: ``action -> g``, or ``(action, level) -> g`` with ``levels``.
+        gradient: ``(action, level) -> g``; ``level`` is an integer tensor of shape ``()``.
         noise: as in :func:`denoise`; every step adds its row.
         step_size: ``eps``, one number, or one of shape ``(S,)`` for each step, first to last.
 
     Keyword Args:
         levels: the noise level of each step, integers of shape ``(S,)``, first to last; annealed
-            Langevin dynamics. Default: the gradient knows none.
+            Langevin dynamics. Default: ``S .. 1``, for a gradient that does not read it.
         guidance_weight: ``w``. Default: 1.
         clip: clip the action after each step to [-1, 1], or to [-c, c] for a number ``c``.
             Default: False.
@@ -175,10 +175,11 @@ def langevin(
     """
     sizes = torch.as_tensor(step_size, dtype=torch.float64, device=noise.device)
     sizes = sizes.expand(len(noise) - 1)
-    known: list[tuple[Tensor, ...]] = [()] * len(sizes) if levels is None else list(zip(levels))
+    if levels is None:
+        levels = torch.arange(len(sizes), 0, -1, device=noise.device)
     steps = [
-        partial(run, _langevin_step, gradient, guidance_weight, clip, eps, *level)
-        for eps, level in zip(sizes, known, strict=True)
+        partial(run, _langevin_step, gradient, guidance_weight, clip, eps, level)
+        for eps, level in zip(sizes, levels, strict=True)
     ]
     return _walk(steps, initial_scale, noise, keep_path, tile_rows)
 
@@ -269,15 +270,16 @@ def _no_noise(action: Tensor, level: Tensor) -> Tensor:
 
 
 def _langevin_step(
-    gradient: Callable[..., Tensor],
+    gradient: Callable[[Tensor, Tensor], Tensor],
     guidance_weight: float | Tensor,
     clip: bool | float,
     step_size: Tensor,
-    *level_action_noise: Tensor,
+    level: Tensor,
+    action: Tensor,
+    noise: Tensor,
 ) -> Tensor:
-    *level, action, noise = level_action_noise
-    gradient_here = gradient(action, *level)
-    action = F.langevin_step(action, gradient_here, guidance_weight, step_size, noise)
+    here = gradient(action, level)
+    action = F.langevin_step(action, here, guidance_weight, step_size, noise)
     return _clipped(action, clip)
 
 

@@ -187,17 +187,14 @@ class DiffusionPolicy(ChainPolicy):
             "tile_rows": self.tile_rows,
             "run": self._run,
         }
+        predict = partial(self._predict, features)
         if self.step_sizes is not None:
-            score = partial(self._score, features)
-            return chain.langevin(score, noise, self.step_sizes, clip=True, **how)
+            return chain.langevin(predict, noise, self.step_sizes, clip=True, **how)
         how.update(clip=self.clip_denoised, clip_step=self.clip_step, variance=self.variance)
-        return chain.denoise(partial(self._noise, features), self.schedule, noise, **how)
+        return chain.denoise(predict, self.schedule, noise, **how)
 
-    def _noise(self, features: Any, action: Tensor, level: Tensor) -> Tensor:
-        return self.network(features, action, level)
-
-    def _score(self, features: Any, action: Tensor) -> Tensor:
-        level = torch.ones((), dtype=torch.long, device=action.device)  # it reads none
+    def _predict(self, features: Any, action: Tensor, level: Tensor) -> Tensor:
+        """Noise, or for Langevin steps a score."""
         return self.network(features, action, level)
 
     @torch.no_grad()
