@@ -32,9 +32,9 @@ from recipe_cases import (
 )
 from torchrl_aca.errors import RunError
 from torchrl_aca.training.checkpoint import list_checkpoints
+from torchrl_aca.training.due import updates_due
 from torchrl_aca.training.envs import make_env
 from torchrl_aca.training.resume import resumed_config
-from torchrl_aca.training.run import updates_due
 from torchrl_aca.training.signals import STOPPED
 
 SCRIPT = RECIPES / "online_mujoco.py"

@@ -19,10 +19,10 @@ from torchrl_aca.training.checkpoint import (
     restore,
     save_checkpoint,
 )
+from torchrl_aca.training.due import has_reached, passed
 from torchrl_aca.training.files import replace_file, write_text
 from torchrl_aca.training.logging import CsvTable, MetricMeans
 from torchrl_aca.training.randomness import RandomState, seed_everything
-from torchrl_aca.training.run import has_reached, passed
 from torchrl_aca.training.run_dir import lock, make_run_dir, require_newest
 from torchrl_aca.training.signals import StopSignal
 

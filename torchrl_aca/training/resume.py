@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_aca.errors import RunError
 from torchrl_aca.training.checkpoint import read_checkpoint
-from torchrl_aca.training.run import has_reached
+from torchrl_aca.training.due import has_reached
 from torchrl_aca.training.run_dir import DONE
 
 MAY_CHANGE_ON_RESUME = (

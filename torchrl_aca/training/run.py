@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import io
 import json
-import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from fractions import Fraction
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
@@ -15,20 +12,20 @@ from typing import Any, Literal
 import torch
 from omegaconf import OmegaConf
 from tensordict import TensorDictBase
-from torchrl.data import ReplayBuffer
 
 from torchrl_aca.errors import RunError
-from torchrl_aca.replay import TRANSITION_KEYS, BufferState, require_index, write_back
-from torchrl_aca.training.agent import Agent, Stateful
-from torchrl_aca.training.checkpoint import Counters, restore, save_checkpoint
+from torchrl_aca.replay import write_back
+from torchrl_aca.training.agent import Agent
+from torchrl_aca.training.checkpoint import Counters, save_checkpoint
 from torchrl_aca.training.collection import BadDataError, Collection
 from torchrl_aca.training.config import RunConfig
+from torchrl_aca.training.due import has_reached, is_better, passed, updates_due
 from torchrl_aca.training.files import write_text
 from torchrl_aca.training.logging import MetricMeans, RunLogger
+from torchrl_aca.training.parts import check_needs, check_savable, make_parts, restore_parts
 from torchrl_aca.training.policy import best_return, policy_path, save_policy
 from torchrl_aca.training.pretrained import save_pretrained
 from torchrl_aca.training.progress import Pace, ProgressBar
-from torchrl_aca.training.randomness import RandomState
 from torchrl_aca.training.report import plot_curve, versions, write_card
 from torchrl_aca.training.run_dir import DONE, lock, make_run_dir, require_newest
 from torchrl_aca.training.signals import StopSignal
@@ -90,25 +87,19 @@ class Run:
         self.means, self.completed = MetricMeans(), False
         self.script, self.facts = script, facts or {}
         self._evaluate, self._device = evaluate, device
-        self._check_needs(buffer)
-        self.parts: dict[str, Stateful] = {
-            **{f"agent.{name}": part for name, part in agent.state.items()},
-            "buffer": as_stateful(buffer, agent),
-            "collection": collection,
-            "means": self.means,
-            "counters": self.counters,
-            "random": RandomState(),  # the last one, because restoring the others may draw
-        }
+        check_needs(cfg, agent, buffer)
+        self.parts = make_parts(agent, buffer, collection, self.means, self.counters)
         if checkpoint is not None:
-            self._restore(checkpoint)
-        notes = self._savable_parts()
+            restore_parts(self.parts, checkpoint, cfg, collection)
+        self._unsavable = collection.why_unsavable()  # from here on it is known not to try
+        check_savable(self.parts)
         task = cfg.env.name.split(":")[-1].replace("/", "-")
         name = f"{task}-{cfg.algo.name}-s{cfg.seed}"
         resumed = checkpoint is not None
         self.dir = Path(cfg.resume or "") if resumed else make_run_dir(cfg.run_dir, name)
         self._lock = lock(self.dir)
         try:
-            self._open(resumed, notes)
+            self._open(resumed)
         except OSError as error:
             self._lock.release()
             raise RunError(f"{self.dir} cannot be written: {error}. Mend that.") from error
@@ -118,50 +109,7 @@ class Run:
 
     # --- beginning --------------------------------------------------------------------------------
 
-    def _check_needs(self, buffer: Any) -> None:
-        cfg, agent = self.cfg, self.agent
-        if cfg.optim.offline_updates and agent.offline_update is None:
-            raise RunError(
-                f"optim.offline_updates={cfg.optim.offline_updates}: expected 0, because "
-                f"algo={cfg.algo.name} has no offline phase. Leave it out."
-            )
-        if agent.rewrites:
-            try:
-                require_index(buffer)
-            except ValueError as error:
-                raise RunError(
-                    f"algo={cfg.algo.name} rewrites rows of its buffer: {error}"
-                ) from error
-
-    def _restore(self, checkpoint: dict[str, Any]) -> None:
-        done, total = checkpoint["parts"]["counters"].get("updates"), self.cfg.optim.total_updates
-        restore(self.parts, checkpoint["parts"])
-        check_rows(checkpoint["parts"]["buffer"], self.collection)
-        if self.counters.updates >= total:
-            raise RunError(
-                f"resume={self.cfg.resume}: the run already has {done} updates; expected "
-                f"optim.total_updates above that, got {total}. Raise it."
-            )
-
-    def _savable_parts(self) -> list[str]:
-        """Takes the state of every part once, so that no part fails at the first checkpoint."""
-        notes = []
-        if why := self.collection.why_unsavable():
-            notes.append(
-                f"the state of {self.cfg.env.name} cannot be saved ({why}): a resumed run begins "
-                "new episodes"
-            )
-        for name, part in self.parts.items():
-            try:
-                torch.save(part.state_dict(), io.BytesIO())
-            except Exception as error:  # parts are foreign code
-                raise RunError(
-                    f"the state of {name!r} cannot be saved ({type(error).__name__}: {error}), so "
-                    "this run would die at its first checkpoint. Mend its state_dict()."
-                ) from error
-        return notes
-
-    def _open(self, resumed: bool, notes: Sequence[str]) -> None:
+    def _open(self, resumed: bool) -> None:
         """Writes what describes the run, and opens its log."""
         counters, cfg = self.counters, self.cfg
         (self.dir / DONE).unlink(missing_ok=True)
@@ -181,12 +129,17 @@ class Run:
         self._signal = StopSignal(self.bar.write)
         self._since = counters.updates
         self._lap = (time.perf_counter(), counters.total, self.collection.frames)
-        for line in (f"run directory: {self.dir}", *notes, *self._outlook()):
+        for line in (f"run directory: {self.dir}", *self._outlook()):
             self.bar.write(line)
 
     def _outlook(self) -> Iterator[str]:
-        """What the user will wait for before the first update shows."""
+        """What the user will wait for before the first update shows, and what will not be saved."""
         settings, optim = self.cfg.collector, self.cfg.optim
+        if why := self._unsavable:
+            yield (
+                f"the state of {self.cfg.env.name} cannot be saved ({why}): a resumed run begins "
+                "new episodes"
+            )
         if (left := optim.offline_updates - self.counters.offline_updates) > 0:
             yield f"the first {left} updates are made on the data set alone"
         if self.collection.frames < settings.warmup_frames:
@@ -361,45 +314,3 @@ class Run:
                 f"stopped by {self._signal.received or 'the loop'} after {self.counters.total} "
                 f"updates; go on with: python {self.script} resume={self.dir}"
             )
-
-
-def as_stateful(buffer: Any, agent: Agent) -> Stateful:
-    """Returns what saves a buffer: TorchRL's own state would hold the empty part as well."""
-    if not isinstance(buffer, ReplayBuffer):
-        return buffer
-    return BufferState(buffer, (*TRANSITION_KEYS, *agent.extra_keys, *agent.rewrites))
-
-
-def check_rows(state: Mapping[str, Any], collection: Collection) -> None:
-    """Raises `RunError` if a checkpoint's replay rows are not those of the environment."""
-    rows = state.get("online", state)["rows"]
-    spec = {**collection.env.observation_spec, **collection.env.full_action_spec}
-    for key in rows.keys() & spec.keys():
-        expected, got = spec[key].shape[-1], rows[key].shape[-1]
-        if expected != got:
-            raise RunError(
-                f"the checkpoint's replay rows have {got} numbers under {key!r}; the environment "
-                f"gives {expected}. Resume with the unchanged config.yaml of the run."
-            )
-
-
-def updates_due(cfg: RunConfig, frames: int) -> int:
-    """Returns how many updates belong to so many frames: exact, with no remainder to carry."""
-    trained = max(0, frames - cfg.collector.warmup_frames)
-    return int(trained * Fraction(str(cfg.optim.utd_ratio)))
-
-
-def passed(interval: int, since: int, now: int) -> bool:
-    """Tells whether a multiple of `interval` lies in the updates after `since`, up to `now`."""
-    return since // interval < now // interval
-
-
-def is_better(value: float, best: float | None) -> bool:
-    """Tells whether an evaluation is above the best one so far; the first one always is."""
-    return best is None or value > best or math.isnan(best)
-
-
-def has_reached(evaluations: Sequence[Mapping[str, Any]], stop_return: float | None) -> bool:
-    """Tells whether the latest two evaluations have averaged `stop_return`."""
-    latest = [float(row["return_mean"]) for row in evaluations[-2:]]
-    return stop_return is not None and len(latest) == 2 and sum(latest) / 2 >= stop_return
