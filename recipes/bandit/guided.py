@@ -21,6 +21,7 @@ from torchrl_aca.baselines import DiffusionPolicy
 from torchrl_aca.langevin_actor import AnnealedLangevinActor
 from torchrl_aca.replay import make_replay_buffer, transitions
 from torchrl_aca.schedule import VarianceExplodingSchedule
+from torchrl_aca.training.acceleration import make_adam
 from torchrl_aca.training.randomness import seed_everything
 
 Actor = CriticGuidedDenoisingActor | DiffusionPolicy
@@ -96,7 +97,7 @@ def train(
     actor, collection = make_actor(cfg, method), cfg.collector
     # Every episode ends with its first step, so the target is the reward and nothing bootstraps.
     loss = ACALoss(actor, delay_qvalue=False, **{"reward_scale": 1.0, **settings})
-    optimizer = torch.optim.Adam(actor.critic.parameters(), lr=cfg.optim.lr)
+    optimizer = make_adam(actor.critic.parameters(), cfg.optim.lr, cudagraphs=False)
     num_updates = collection.frames // collection.frames_per_batch * cfg.optim.updates_per_batch
     scheduler = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, num_updates)
     buffer = make_replay_buffer(collection.frames, cfg.optim.batch_size)

@@ -21,6 +21,7 @@ from torchrl_aca.baselines import (
     TwinCritic,
 )
 from torchrl_aca.replay import make_replay_buffer, transitions, write_back
+from torchrl_aca.training.acceleration import make_adam
 from torchrl_aca.training.randomness import seed_everything
 
 LOSSES: dict[str, type[DiffusionPolicyLoss]] = {
@@ -68,7 +69,7 @@ def train(cfg: BanditConfig, method: str, seed: int) -> DiffusionPolicy:
     networks = {"loss_qvalue": loss.qvalue_network, "loss_actor": loss.policy_network}
     rates = {"loss_qvalue": cfg.optim.lr, "loss_actor": settings.lr}
     optimizers = {
-        name: torch.optim.Adam(network.parameters(), lr=rates[name])
+        name: make_adam(network.parameters(), rates[name], cudagraphs=False)
         for name, network in networks.items()
     }
     num_updates = collection.frames // collection.frames_per_batch * settings.updates_per_batch
