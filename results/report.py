@@ -24,7 +24,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from curves import draw_marks, draw_mean, make_panels
 from evaluations import (
@@ -40,13 +39,8 @@ from evaluations import (
     values_at,
     viewed,
 )
-from intervals import (
-    interquartile_mean,
-    interval,
-    mean,
-    probability_of_improvement,
-    share_above,
-)
+from figures import draw_points, draw_profiles
+from intervals import interquartile_mean, interval, mean, probability_of_improvement
 
 PAPER = Path(__file__).parent / "paper.csv"
 Lines = dict[str, dict[str, float]]  # of each task: names and values
@@ -117,13 +111,13 @@ def paper(task: str, updates: float) -> dict[str, str]:
 
 def runs_table(rows: Sequence[Row]) -> str:
     """A row for each run: how far it came, what it took, and the version that made it."""
-    last = {(row["task"], row["method"], row["seed"]): row for row in rows}
-    first = {
-        key: row for row in reversed(rows) if (key := (row["task"], row["method"], row["seed"]))
-    }
+    runs: dict[Any, list[Row]] = {}
+    for row in rows:
+        runs.setdefault((row["task"], row["method"], row["seed"]), []).append(row)
     lines = []
-    for key, row in last.items():
-        offline = max(0, -first[key]["updates"])
+    for own in runs.values():
+        first, row = own[0], own[-1]
+        offline = max(0, -first["updates"])
         updates = f"{offline:,.0f} + {row['updates']:,.0f}" if offline else f"{row['updates']:,.0f}"
         minutes = f"{row['seconds'] / 60:.0f}" if row["seconds"] != "" else ""
         made = f"{row['return_mean']:.0f} ± {row['return_std']:.0f}"
@@ -161,41 +155,6 @@ def draw_curves(rows: Sequence[Row], path: Path, labels: tuple[str, str], lines:
                 draw_mean(axes, f"{method}, n={len(runs)}", runs)
         draw_marks(axes, lines.get(task, {}))
         axes.legend(frameon=False, fontsize="small")
-    figure.savefig(path, dpi=120)
-
-
-def draw_points(path: Path, xlabel: str, points: dict[str, tuple[float, Any]]) -> None:
-    """Values with their intervals, one below the other."""
-    figure = Figure(figsize=(5.5, 1 + 0.35 * len(points)), layout="constrained")
-    axes = figure.subplots()
-    for place, (value, found) in enumerate(points.values()):
-        if found:
-            axes.plot(found, [place, place], linewidth=6, alpha=0.4, color="C0")
-        axes.plot([value], [place], "|", color="black", markersize=12)
-    axes.set_yticks(range(len(points)), list(points))
-    axes.invert_yaxis()
-    axes.set_xlabel(xlabel)
-    axes.grid(alpha=0.3, axis="x")
-    figure.savefig(path, dpi=120)
-
-
-def draw_profiles(found: Scores, path: Path) -> None:
-    """The share of runs above each score."""
-    figure = Figure(figsize=(5.5, 3.5), layout="constrained")
-    axes = figure.subplots()
-    thresholds = np.linspace(0, max(1.2, *(v.max() for t in found.values() for v in t)), 41)
-    for method, tasks in found.items():
-        shares = [share_above(threshold)(*tasks) for threshold in thresholds]
-        (line,) = axes.step(thresholds, shares, where="post", label=method)
-        bands = [interval(share_above(threshold), tasks) for threshold in thresholds]
-        if None not in bands:
-            low, high = zip(*bands, strict=True)
-            axes.fill_between(
-                thresholds, low, high, alpha=0.2, color=line.get_color(), linewidth=0, step="post"
-            )
-    axes.set(xlabel="score", ylabel="share of runs above")
-    axes.grid(alpha=0.3)
-    axes.legend(frameon=False)
     figure.savefig(path, dpi=120)
 
 
@@ -257,7 +216,7 @@ def parse_lines(texts: Sequence[str]) -> Lines:
 
 
 def aggregates(rows: Sequence[Row], tasks: Sequence[str], found: Scores, out: Path) -> str:
-    """The part of the card over all tasks, and its figures."""
+    """The part of the card that compares several methods over all tasks, and its figures."""
     statistic = interquartile_mean
     points = {m: (float(statistic(*t)), interval(statistic, t)) for m, t in found.items()}
     draw_points(out / "aggregate.png", "interquartile mean of the scores", points)
@@ -265,15 +224,13 @@ def aggregates(rows: Sequence[Row], tasks: Sequence[str], found: Scores, out: Pa
     text = (
         f"\nScores over {', '.join(tasks)}: 0 is the mean before training, 1 the best method's "
         f"mean. Intervals are stratified over tasks.\n\n{aggregate_table(rows, found)}\n\n"
-        "![aggregate](aggregate.png)\n\n![profiles](profiles.png)"
+        "![aggregate](aggregate.png)\n\n![profiles](profiles.png)\n\n![improvement](improvement.png)"
     )
     first, *others = reversed(found)
-    if others:
-        pairs = {f"{first} > {other}": [*found[first], *found[other]] for other in others}
-        improvement = probability_of_improvement
-        points = {k: (float(improvement(*t)), interval(improvement, t)) for k, t in pairs.items()}
-        draw_points(out / "improvement.png", "probability of improvement", points)
-        text += "\n\n![improvement](improvement.png)"
+    pairs = {f"{first} > {other}": [*found[first], *found[other]] for other in others}
+    improvement = probability_of_improvement
+    points = {k: (float(improvement(*t)), interval(improvement, t)) for k, t in pairs.items()}
+    draw_points(out / "improvement.png", "probability of improvement", points)
     return text
 
 
