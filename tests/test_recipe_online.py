@@ -72,6 +72,7 @@ def test_run_directory(unbroken):
     assert OmegaConf.load(unbroken / "config.yaml").optim.lr == 3e-4
     versions = json.loads((unbroken / "versions.json").read_text())
     assert versions["torch"] == torch.__version__ and versions["threads"] == 1
+    assert versions["parameters"] > 0
     assert "Hopper-v4" in (unbroken / "card.md").read_text()
 
 

@@ -14,6 +14,7 @@ import torchrl_aca
 from agents.learning_rate import DecayOptim, linear_decay
 from torchrl_aca import make_aca_actor
 from torchrl_aca.chain import check_levels
+from torchrl_aca.make import ACAParts
 from torchrl_aca.training.acceleration import capture, compiled, descend, make_adam
 from torchrl_aca.training.agent import Agent
 from torchrl_aca.training.checkpoint import Counters
@@ -114,34 +115,44 @@ def actor_settings(cfg: Any) -> dict[str, Any]:
     }
 
 
+def loss_settings(cfg: Any) -> dict[str, Any]:
+    """The keywords of `ACALoss`."""
+    settings = cfg.aca
+    return {
+        "target_value": settings.target_value,
+        "temperature": settings.temperature,
+        "guidance_weight": "auto" if settings.auto_guidance else "fixed",
+        "guidance_weight_lr": settings.guidance_weight_lr,
+        "noise_level_target": settings.noise_level_target,
+        "target_entropy_scale": settings.target_entropy_scale,
+        "reward_scale": settings.reward_scale,
+    }
+
+
+def make_parts(cfg: Any, env: EnvBase, device: torch.device) -> ACAParts:
+    """Loss, targets and optimisers."""
+    return torchrl_aca.make_aca(
+        env,
+        **actor_settings(cfg),
+        compile_step=cfg.compile,
+        num_target_candidates=cfg.aca.num_target_candidates,
+        loss=loss_settings(cfg),
+        gamma=cfg.optim.gamma,
+        tau=cfg.optim.tau,
+        lr=cfg.optim.lr,
+        alpha_lr=cfg.optim.alpha_lr,
+        make_optimizer=partial(make_adam, cudagraphs=cfg.cudagraphs),
+        device=device,
+    )
+
+
 def make_aca(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
     """ACA, in the official code's order: a TD step, then at even updates a noise-level step.
 
     The four steps are functions of a batch alone, so that each can be captured as a CUDA graph;
     what changes from update to update, which of them to take and the learning rate, stays outside.
     """
-    settings, optim, actor = cfg.aca, cfg.optim, actor_settings(cfg)
-    aca = torchrl_aca.make_aca(
-        env,
-        **actor,
-        compile_step=cfg.compile,
-        num_target_candidates=settings.num_target_candidates,
-        loss={
-            "target_value": settings.target_value,
-            "temperature": settings.temperature,
-            "guidance_weight": "auto" if settings.auto_guidance else "fixed",
-            "guidance_weight_lr": settings.guidance_weight_lr,
-            "noise_level_target": settings.noise_level_target,
-            "target_entropy_scale": settings.target_entropy_scale,
-            "reward_scale": settings.reward_scale,
-        },
-        gamma=optim.gamma,
-        tau=optim.tau,
-        lr=optim.lr,
-        alpha_lr=optim.alpha_lr,
-        make_optimizer=partial(make_adam, cudagraphs=cfg.cudagraphs),
-        device=device,
-    )
+    settings, optim, aca = cfg.aca, cfg.optim, make_parts(cfg, env, device)
     loss, optimizer, alpha_optimizer = aca.loss, aca.optimizer, aca.alpha_optimizer
     # The decay counts steps of the optimiser, of which an update takes one or two.
     scheduler = linear_decay(optimizer, optim, optim.lr, optim.lr_end)
@@ -193,5 +204,5 @@ def make_aca(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
             "scheduler": scheduler,
             "progress": progress,
         },
-        policy_builder=PolicyBuilder.of(env, make_aca_actor, **actor),
+        policy_builder=PolicyBuilder.of(env, make_aca_actor, **actor_settings(cfg)),
     )
