@@ -13,7 +13,7 @@ import yaml
 from hydra import initialize_config_dir
 
 from recipe_cases import CONFIGS, ROOT, TINY, composed, rows_of, run, start
-from studies.jobs import Job, StudyConfig, make_jobs
+from studies.jobs import Job, StudyConfig, make_jobs, write_study
 from studies.status import State, left_seconds, state_of, summary
 from torchrl_aca.errors import RunError
 from torchrl_aca.training.config import checked
@@ -87,6 +87,20 @@ def test_a_mistake_in_any_job_is_told_before_the_first_one_starts(study, overrid
         study("study=tiny", override)
 
 
+def test_a_part_of_a_study_leaves_the_names_of_the_rest(tmp_path):
+    whole, part = (
+        checked(StudyConfig, composed(*words, f"dir={tmp_path}", name="study"))
+        for words in (["study=tiny"], ["study=tiny", "~study.methods.sac", "study.seeds=[7]"])
+    )
+    for cfg in (whole, part):
+        write_study(cfg)
+    written = yaml.safe_load((tmp_path / "study.yaml").read_text())
+    assert list(written["methods"]) == ["aca", "sac"] and written["seeds"] == [7]
+    other = checked(StudyConfig, composed("study=table2", f"dir={tmp_path}", name="study"))
+    with pytest.raises(RunError, match="holds the study tiny"):
+        write_study(other)
+
+
 def write_progress(run_dir: Path, updates: int, seconds: float, done: bool = False) -> None:
     run_dir.mkdir(parents=True)
     (run_dir / "metrics.csv").write_text(
@@ -118,7 +132,7 @@ def test_states_and_expected_time_are_read_from_the_directories(study, tmp_path)
         assert state_of(jobs[2]).name == name
 
 
-def write_study(folder: Path) -> None:
+def write_mine(folder: Path) -> None:
     methods = {name: [o for o in TINY["sac"] if o != "env=hopper"] for name in ("one", "two")}
     methods["bad"] = ["algo=sac", "env.name=Nowhere-v0"]
     text = f"""name: mine
@@ -145,7 +159,7 @@ def pid_of(words: str) -> int | None:
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/cmdline").exists(), reason="finds a job by /proc")
 def test_killed_and_bad_jobs_are_told_the_others_go_on_and_the_same_command_goes_on(tmp_path):
-    write_study(tmp_path)
+    write_mine(tmp_path)
     command = ["--config-dir", str(tmp_path), "study=mine", "launcher.jobs=2"]
     process = start(*command, cwd=tmp_path, recipe="study")
     one, two, bad = (

@@ -152,13 +152,19 @@ def _jobs_of(cfg: StudyConfig, task: str, method: str) -> Iterator[Job]:
 
 
 def write_study(cfg: StudyConfig) -> None:
-    """Keeps what the study is in its directory.
+    """Keeps what the study is in its directory, with the tasks and methods of earlier calls.
 
     Raises:
         RunError: If the directory is that of another study.
     """
-    path = study_dir(cfg) / "study.yaml"
-    if path.exists() and (found := OmegaConf.load(path).name) != cfg.study.name:
-        raise RunError(f"dir={path.parent} holds the study {found}; expected a new directory.")
+    path, study = study_dir(cfg) / "study.yaml", OmegaConf.create(cfg.study.model_dump())
+    if path.exists():
+        found = OmegaConf.load(path)
+        if found.name != study.name:
+            raise RunError(
+                f"dir={path.parent} holds the study {found.name}; expected a new directory."
+            )
+        for key in ("tasks", "methods"):  # a part of a study may be run on its own
+            study[key] = {**found[key], **study[key]}
     path.parent.mkdir(parents=True, exist_ok=True)
-    OmegaConf.save(OmegaConf.create(cfg.study.model_dump()), path)
+    OmegaConf.save(study, path)
