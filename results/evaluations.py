@@ -104,8 +104,8 @@ def _times(metrics: Sequence[Row], rows: Sequence[Row]) -> list[Any]:
     """When each evaluation was made, by the latest row of metrics before it: seconds."""
     timed = [row for row in metrics if row.get("seconds")]
     places = [row["updates"] + row.get("offline_updates", 0) for row in timed]
-    offset = -rows[0]["updates"]  # of the offline phase
-    found = [bisect_right(places, row["updates"] + offset) for row in rows]
+    offline = rows[-1].get("offline_updates", 0)  # also those that another run has made
+    found = [bisect_right(places, row["updates"] + offline) for row in rows]
     return [round(timed[i - 1]["seconds"], 1) if i else 0.0 for i in found]
 
 

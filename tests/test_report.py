@@ -116,6 +116,11 @@ def test_an_offline_phase_is_below_zero_and_at_no_frame(tmp_path):
     )
     rows = evaluations.read_study(study)
     assert [(row["updates"], row["seconds"]) for row in rows] == [(-40, 0.0), (0, 8.0), (20, 30.0)]
+    with_own_phase = (run_dir / "eval.csv").read_text()
+    (run_dir / "eval.csv").write_text(with_own_phase.replace("0,0,0,5,1,10,0.5\n", ""))
+    rows = evaluations.read_study(study)  # as of a run that began with another one's phase
+    assert [(row["updates"], row["seconds"]) for row in rows] == [(0, 8.0), (20, 30.0)]
+    (run_dir / "eval.csv").write_text(with_own_phase)
     options = ["--x", "frames", "--value", "normalized_score", "--at", "0", "60"]
     line = ["--line", "Hopper-v4:data=7.5"]
     call = [sys.executable, str(SCRIPT), str(study), str(tmp_path / "out"), *options, *line]
