@@ -77,13 +77,14 @@ def read_run(run_dir: Path) -> list[Row]:
         return []
     metrics = read_csv(run_dir / "metrics.csv") if (run_dir / "metrics.csv").exists() else []
     speeds = [row["updates_per_second"] for row in metrics if row.get("updates_per_second")]
-    task, method = place_in_study(run_dir, config)
+    (task, method), versions = place_in_study(run_dir, config), _versions(run_dir)
     own = {
         "task": task,
         "method": method,
         "seed": config.seed,
         "updates_per_second": round(float(np.median(speeds)), 3) if speeds else "",
-        **{name: _versions(run_dir).get(name) or "" for name in ("parameters", "commit")},
+        "parameters": float(count) if (count := versions.get("parameters")) else "",
+        "commit": versions.get("commit") or "",
     }
     times = _times(metrics, rows)
     return [
