@@ -145,9 +145,8 @@ def by_seed(rows: Sequence[Row], task: str, method: str) -> dict[float, dict[flo
 
 def last_shared(rows: Sequence[Row], task: str) -> float:
     """The last place at which all runs of a task were evaluated."""
-    return shared([run for m in names(rows, "method") for run in by_seed(rows, task, m).values()])[
-        -1
-    ]
+    runs = [run for m in names(rows, "method") for run in by_seed(rows, task, m).values()]
+    return shared(runs)[-1]
 
 
 def values_at(rows: Sequence[Row], task: str, method: str, place: float) -> np.ndarray:

@@ -122,6 +122,10 @@ def test_a_folder_stands_for_the_runs_in_it_and_one_without_is_told(plot, tmp_pa
         plot.runs_in(tmp_path / "empty")
 
 
+def test_there_are_cards():
+    assert {"campaign", "o2o_halfcheetah", "offline_to_online"} < {c.parent.name for c in CARDS}
+
+
 @pytest.mark.parametrize("card", CARDS, ids=lambda card: card.parent.name)
 def test_cards_are_what_their_command_prints(card, tmp_path):
     text = card.read_text()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
 from pydantic import Field, PlainSerializer, WrapValidator, model_validator
@@ -15,7 +15,7 @@ from agents.learning_rate import DecayOptim, linear_decay
 from torchrl_aca import make_aca_actor
 from torchrl_aca.chain import check_levels
 from torchrl_aca.make import ACAParts
-from torchrl_aca.training.acceleration import capture, compiled, descend, make_adam
+from torchrl_aca.training.acceleration import Step, capture, compiled, descend, make_adam
 from torchrl_aca.training.agent import Agent
 from torchrl_aca.training.checkpoint import Counters
 from torchrl_aca.training.config import (
@@ -146,51 +146,62 @@ def make_parts(cfg: Any, env: EnvBase, device: torch.device) -> ACAParts:
     )
 
 
-def make_aca(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
-    """ACA, in the official code's order: a TD step, then at even updates a noise-level step.
+class Steps(NamedTuple):
+    """What an update consists of: functions of a batch alone, each captured as a CUDA graph."""
 
-    The four steps are functions of a batch alone, so that each can be captured as a CUDA graph;
-    what changes from update to update, which of them to take and the learning rate, stays outside.
-    """
-    settings, optim, aca = cfg.aca, cfg.optim, make_parts(cfg, env, device)
-    loss, optimizer, alpha_optimizer = aca.loss, aca.optimizer, aca.alpha_optimizer
-    # The decay counts steps of the optimiser, of which an update takes one or two.
-    scheduler = linear_decay(optimizer, optim, optim.lr, optim.lr_end)
-    progress = Counters()
+    td: Step
+    noise_level: Step
+    target: Step
+    alpha: Step
+
+
+def make_steps(cfg: Any, aca: ACAParts) -> Steps:
+    """The four steps of ACA's update, compiled and captured where that is enabled."""
+    loss, captured = aca.loss, partial(capture, enabled=cfg.cudagraphs)
     # The chain compiles its own step, so it is drawn before the compiled loss.
     qvalue_loss = compiled(loss.qvalue_loss, cfg.compile)
     noise_level_loss = compiled(loss.noise_level_loss, cfg.compile)
 
-    @partial(capture, enabled=cfg.cudagraphs)
-    def td_step(batch: TensorDictBase) -> TensorDictBase:
+    def td(batch: TensorDictBase) -> TensorDictBase:
         batch = batch.copy()
         batch[loss.tensor_keys.next_action] = loss.sample_next_action(batch)
-        metrics = descend(qvalue_loss(batch), "loss_qvalue", optimizer)
-        if settings.auto_guidance:
+        metrics = descend(qvalue_loss(batch), "loss_qvalue", aca.optimizer)
+        if cfg.aca.auto_guidance:
             metrics.update(loss.step_guidance_weight(batch))
         return metrics
 
-    @partial(capture, enabled=cfg.cudagraphs)
-    def noise_level_step(batch: TensorDictBase) -> TensorDictBase:
-        return descend(noise_level_loss(batch), "loss_noise_level", optimizer)
+    def noise_level(batch: TensorDictBase) -> TensorDictBase:
+        return descend(noise_level_loss(batch), "loss_noise_level", aca.optimizer)
 
-    @partial(capture, enabled=cfg.cudagraphs)
-    def alpha_step(batch: TensorDictBase) -> TensorDictBase:
-        return descend(loss.alpha_loss(), "loss_alpha", alpha_optimizer)
-
-    @partial(capture, enabled=cfg.cudagraphs)
-    def target_step(batch: TensorDictBase) -> None:
+    def target(batch: TensorDictBase) -> None:
         aca.target_update.step()
 
+    def alpha(batch: TensorDictBase) -> TensorDictBase:
+        return descend(loss.alpha_loss(), "loss_alpha", aca.alpha_optimizer)
+
+    return Steps(*map(captured, (td, noise_level, target, alpha)))
+
+
+def make_aca(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
+    """ACA, in the official code's order: a TD step, then at even updates a noise-level step.
+
+    What changes from update to update, which steps to take and the learning rate, stays outside of
+    the steps.
+    """
+    settings, aca, progress = cfg.aca, make_parts(cfg, env, device), Counters()
+    # The decay counts steps of the optimiser, of which an update takes one or two.
+    scheduler = linear_decay(aca.optimizer, cfg.optim, cfg.optim.lr, cfg.optim.lr_end)
+    step = make_steps(cfg, aca)
+
     def update(batch: TensorDictBase) -> TensorDictBase:
-        metrics = td_step(batch)
+        metrics = step.td(batch)
         scheduler.step()
         if progress.updates % settings.noise_level_interval == 0:
-            metrics.update(noise_level_step(batch))
+            metrics.update(step.noise_level(batch))
             scheduler.step()
-        target_step(batch)
+        step.target(batch)
         if progress.updates % settings.alpha_interval == 0:
-            metrics.update(alpha_step(batch))
+            metrics.update(step.alpha(batch))
         progress.updates += 1
         return metrics
 
@@ -198,9 +209,9 @@ def make_aca(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
         aca.actor,
         update,
         state={
-            "loss": loss,
-            "optimizer": optimizer,
-            "alpha_optimizer": alpha_optimizer,
+            "loss": aca.loss,
+            "optimizer": aca.optimizer,
+            "alpha_optimizer": aca.alpha_optimizer,
             "scheduler": scheduler,
             "progress": progress,
         },
