@@ -7,6 +7,7 @@ matrix-product roofline of the machine at that moment and with the yardstick. No
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -127,15 +128,6 @@ def test_acting(benchmark, num_states, num_candidates, variant):
     sampling(benchmark, "HalfCheetah", num_states, num_candidates, variant, case)
 
 
-@pytest.mark.parametrize("num_inference_steps", [20, 8, 6])
-def test_short_chains(benchmark, num_inference_steps):
-    observation = torch.randn(BATCH, SIZES["HalfCheetah"][0])
-    actor = make_actor("HalfCheetah", "compiled", 1, num_inference_steps=num_inference_steps)
-    case = f"HalfCheetah: target actions, {BATCH} states x 1, chain of {num_inference_steps} steps"
-    work = flops(BATCH, 6) * (num_inference_steps - 1) / (NUM_STEPS - 1)
-    measure(benchmark, lambda: actor.sample(observation, [BATCH]), BATCH, case, "compiled", work)
-
-
 @pytest.mark.parametrize("precision", ["highest", "medium"])
 @pytest.mark.parametrize("num_candidates", [1, 32])
 def test_precision(benchmark, num_candidates, precision):
@@ -186,18 +178,38 @@ def test_update(benchmark, size, num_candidates, variant):
         def call():
             plain.update(batch, num_candidates)
     else:
-        cfg = configure(
-            f"env={size.lower()}",
+        call = recipe_update(
+            size,
+            batch,
             f"aca.num_target_candidates={num_candidates}",
-            "aca.noise_level_interval=1",  # both steps in every update, as in the yardstick
             f"compile={variant == 'compiled'}",
         )
-        torch._dynamo.reset()
-        agent = make_recipe_agent(cfg, make_vector_env(cfg.env.name, 1, seed=0))
-
-        def call():
-            agent.update(batch)
 
     rows = BATCH * num_candidates
     case = f"{size}: update, {num_candidates} target candidates"
     measure(benchmark, call, rows, case, variant, flops(rows, SIZES[size][1]))
+
+
+@pytest.mark.parametrize("num_levels", [20, 10, 8, 6])
+@pytest.mark.parametrize("num_candidates", [1, 4])
+def test_update_by_a_short_chain(benchmark, num_candidates, num_levels):
+    """The same update with a chain that visits fewer levels."""
+    call = recipe_update(
+        "HalfCheetah",
+        make_batch("HalfCheetah"),
+        f"aca.num_target_candidates={num_candidates}",
+        f"aca.num_inference_steps={num_levels}",
+        "compile=true",
+    )
+    rows = BATCH * num_candidates
+    case = f"HalfCheetah: update, {num_candidates} target candidates, chain of {num_levels} levels"
+    work = flops(rows, SIZES["HalfCheetah"][1]) * (num_levels - 1) / (NUM_STEPS - 1)
+    measure(benchmark, call, rows, case, "compiled", work)
+
+
+def recipe_update(size: str, batch: TensorDict, *overrides: str) -> Callable[[], object]:
+    """An update of the recipe, with both steps each time, as the yardstick's has them."""
+    torch._dynamo.reset()
+    cfg = configure(f"env={size.lower()}", "aca.noise_level_interval=1", *overrides)
+    agent = make_recipe_agent(cfg, make_vector_env(cfg.env.name, 1, seed=0))
+    return lambda: agent.update(batch)

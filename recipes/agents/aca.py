@@ -129,7 +129,7 @@ def loss_settings(cfg: Any) -> dict[str, Any]:
     }
 
 
-def make_parts(cfg: Any, env: EnvBase, device: torch.device) -> ACAParts:
+def make_aca_parts(cfg: Any, env: EnvBase, device: torch.device) -> ACAParts:
     """Loss, targets and optimisers."""
     return torchrl_aca.make_aca(
         env,
@@ -188,7 +188,7 @@ def make_aca(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
     What changes from update to update, which steps to take and the learning rate, stays outside of
     the steps.
     """
-    settings, aca, progress = cfg.aca, make_parts(cfg, env, device), Counters()
+    settings, aca, progress = cfg.aca, make_aca_parts(cfg, env, device), Counters()
     # The decay counts steps of the optimiser, of which an update takes one or two.
     scheduler = linear_decay(aca.optimizer, cfg.optim, cfg.optim.lr, cfg.optim.lr_end)
     step = make_steps(cfg, aca)
