@@ -15,7 +15,7 @@ from __future__ import annotations
 import argparse
 import csv
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -124,8 +124,16 @@ def checkpoints(args: argparse.Namespace) -> Iterator[tuple[str, int, dict[str, 
         kept = [updates_of(path) for path in list_checkpoints(run_dir / "checkpoints")]
         for updates in args.updates or kept[-1:] or [None]:
             checkpoint = read_checkpoint(run_dir, updates)
-            states = checkpoint["parts"]["buffer"]["rows"]["observation"][-args.states :]
+            states = newest_states(checkpoint["parts"]["buffer"], args.states)
             yield run_dir.name, updates, read_policy(run_dir, updates), states
+
+
+def newest_states(buffer: Mapping[str, Any], number: int) -> Tensor:
+    """The last observations that went into a buffer, of a mixture into its online half."""
+    online = buffer.get("online", buffer)
+    if "observation" not in online["rows"]:
+        raise RunError("a checkpoint without a frame has no states. Give --updates of a later one.")
+    return online["rows"]["observation"].roll(-online["writer"]["_cursor"], 0)[-number:]
 
 
 def guided(policy: dict[str, Any]) -> CriticGuidedDenoisingActor:

@@ -11,6 +11,7 @@ normalised score, and adds a row to `evaluations.csv` in the run directory. Ever
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -67,7 +68,8 @@ def evaluate_runs(cfg: EvaluateConfig) -> list[dict[str, Any]]:
         for run_dir, content in stored.items():
             path = run_dir / f"video_{name_of(cfg, content)}.mp4"
             policy, task = build_policy(content, device), checked(Env, content["config"]["env"])
-            record_video(policy, task, path, cfg.seed, device)
+            limit = settings_of(cfg, content["config"]).max_steps
+            record_video(policy, task, path, cfg.seed, device, max_steps=limit)
             print(f"video: {path}")
     return rows
 
@@ -78,10 +80,7 @@ def evaluate_run(
     """Returns a row for the policy and, if it is asked for, one for random actions."""
     config = content["config"]
     require_other_seeds(cfg, config)
-    episodes = {"episodes": cfg.episodes, "seed": cfg.seed}
-    limit = {} if cfg.max_steps is None else {"max_steps": cfg.max_steps}
-    settings = checked(Eval, {**config["eval"], **episodes, **limit})
-    env = make_eval_env(checked(Env, config["env"]), settings)
+    env = make_eval_env(checked(Env, config["env"]), settings_of(cfg, config))
     policies = [(name_of(cfg, content), build_policy(content, device), device)]
     if cfg.random:
         policies.append(("random", RandomPolicy(env.action_spec), torch.device("cpu")))
@@ -93,6 +92,14 @@ def evaluate_run(
         rows.append({"checkpoint": name, "updates": updates, **summary(result, scores, cfg.seed)})
     env.close()
     return rows
+
+
+def settings_of(cfg: EvaluateConfig, config: Mapping[str, Any]) -> Eval:
+    """The run's own settings of an evaluation, with what is asked for here."""
+    asked = {"episodes": cfg.episodes, "seed": cfg.seed}
+    if cfg.max_steps is not None:
+        asked["max_steps"] = cfg.max_steps
+    return checked(Eval, {**config["eval"], **asked})
 
 
 def summary(

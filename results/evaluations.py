@@ -51,10 +51,15 @@ def read_csv(path: Path) -> list[Row]:
 
 def read_evaluations(run_dir: Path) -> tuple[DictConfig, list[Row]]:
     """The configuration of a run, and its evaluations, those of an offline phase below zero."""
-    rows = read_csv(run_dir / "eval.csv")
+    rows, config = read_csv(run_dir / "eval.csv"), OmegaConf.load(run_dir / "config.yaml")
     for row in rows:
-        row["updates"] += row.get("offline_updates", 0) - rows[-1].get("offline_updates", 0)
-    return OmegaConf.load(run_dir / "config.yaml"), rows
+        row["updates"] += row.get("offline_updates", 0) - _offline_updates(config)
+    return config, rows
+
+
+def _offline_updates(config: DictConfig) -> int:
+    """The length of a run's offline phase, which it may still be in."""
+    return OmegaConf.select(config, "optim.offline_updates", default=0)
 
 
 def read_study(source: Path) -> list[Row]:
@@ -86,7 +91,7 @@ def read_run(run_dir: Path) -> list[Row]:
         "parameters": float(count) if (count := versions.get("parameters")) else "",
         "commit": versions.get("commit") or "",
     }
-    times = _times(metrics, rows)
+    times = _times(metrics, rows, _offline_updates(config))
     return [
         dict.fromkeys(COLUMNS, "")
         | {name: value for name, value in row.items() if name in COLUMNS}
@@ -101,12 +106,11 @@ def _versions(run_dir: Path) -> dict[str, Any]:
     return json.loads(path.read_text()) if path.exists() else {}
 
 
-def _times(metrics: Sequence[Row], rows: Sequence[Row]) -> list[Any]:
+def _times(metrics: Sequence[Row], rows: Sequence[Row], offline_updates: int) -> list[Any]:
     """When each evaluation was made, by the latest row of metrics before it: seconds."""
     timed = [row for row in metrics if row.get("seconds")]
     places = [row["updates"] + row.get("offline_updates", 0) for row in timed]
-    offline = rows[-1].get("offline_updates", 0)  # also those that another run has made
-    found = [bisect_right(places, row["updates"] + offline) for row in rows]
+    found = [bisect_right(places, row["updates"] + offline_updates) for row in rows]
     return [round(timed[i - 1]["seconds"], 1) if i else 0.0 for i in found]
 
 

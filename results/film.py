@@ -48,7 +48,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         task = checked(Env, content["config"]["env"])
         if args.camera:
             task.kwargs = {**(task.kwargs or {}), "camera_name": args.camera}
-        record_video(build_policy(content), task, film, args.seed, torch.device("cpu"))
+        limit = content["config"]["eval"]["max_steps"]
+        policy, cpu = build_policy(content), torch.device("cpu")
+        record_video(policy, task, film, args.seed, cpu, max_steps=limit)
         animate(film, args.output, args.seconds, args.width)
     print(f"{args.output}: {content['config']['env']['name']} after {content['updates']} updates")
 

@@ -67,6 +67,8 @@ def returns(rows: list[Row], task: str) -> Points:
 
 def draw(axes: Axes, title: str, ylabel: str, points: Points) -> None:
     """A line for each entry."""
+    if not points:
+        raise SystemExit(f"error: nothing to draw for {title!r}. Run what measures it first.")
     for label, line in points.items():
         levels = sorted(line)
         axes.plot(levels, [line[level] for level in levels], marker="o", markersize=4, label=label)

@@ -10,7 +10,7 @@ from hydra import compose, initialize_config_dir
 import o2o_halfcheetah
 from recipe_cases import CONFIGS
 from torchrl_aca.offline import DatasetWriter
-from torchrl_aca.training.resume import resumed_config
+from torchrl_aca.training.launch import start
 
 SIZES = {"observation_dim": 11, "action_dim": 3}  # Hopper's
 MARK = 1000.0  # below every offline reward, above every online one
@@ -86,10 +86,7 @@ def record(
 def run_o2o(*overrides: str, name: str = "o2o_halfcheetah") -> Path:
     """The recipe without a process of its own: takes overrides, as the command does."""
     with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-        cfg = compose(name, list(overrides))
-        if cfg.resume is None:
-            return o2o_halfcheetah.train(cfg)
-        return o2o_halfcheetah.train(*resumed_config(cfg, overrides))
+        return start(o2o_halfcheetah.train, compose(name, list(overrides)), overrides)
 
 
 def settings(data: Path, run_dir: Path, algo: str = "aca") -> list[str]:

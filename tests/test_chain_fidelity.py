@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 import chain_fidelity
 from fidelity.measures import border_shares, energy_distance_test, spread
@@ -12,6 +13,8 @@ from online_mujoco import train
 from recipe_cases import TINY, composed, rows_of
 from torchrl_aca import CriticGuidedDenoisingActor, NoiseLevelCritic, NoiseSchedule
 from torchrl_aca.chain import check_levels, inference_levels
+from torchrl_aca.errors import RunError
+from torchrl_aca.replay import BufferState, make_replay_buffer
 
 
 def test_energy_distance_by_hand():
@@ -48,6 +51,17 @@ def test_shares_at_the_border_by_hand():
     path = idle.trajectory(states, torch.randn(5, 6, 5, 2))
     beyond = [(path[4 - k].abs() > schedule.alphas_cumprod[k - 1].sqrt()) for k in (1, 2, 3, 4)]
     assert shares == pytest.approx([float(b.double().mean()) for b in beyond])
+
+
+def test_the_newest_states_of_a_full_buffer_and_of_a_mixture():
+    buffer = make_replay_buffer(4, 2)
+    state = BufferState(buffer, ["observation"])
+    with pytest.raises(RunError, match="without a frame has no states"):
+        chain_fidelity.newest_states(state.state_dict(), 2)
+    for number in range(6):
+        buffer.extend(TensorDict(observation=torch.full((1, 1), number), batch_size=[1]))
+        newest = chain_fidelity.newest_states({"online": state.state_dict()}, 2)
+        assert newest.flatten().tolist() == [number - 1, number][-1 - number :]
 
 
 @pytest.mark.parametrize("spacing", [PACKAGE, *SPACINGS])

@@ -29,6 +29,7 @@ from loss_cases import (
 )
 from torchrl_aca.baselines import EnsembleSACLoss
 from torchrl_aca.baselines.cql import WSRL_SETTINGS
+from torchrl_aca.baselines.ensemble_sac import TEMPERATURES
 
 NUM, BACKUP = 3, 2  # of the cases: actions of each kind, and in the backup
 CASES = {
@@ -214,9 +215,17 @@ def test_one_backup_action_with_entropy_is_the_target_of_the_parent():
     assert conservative["target_value"].item() == pytest.approx(plain["target_value"].item())
 
 
+def test_a_large_weight_and_temperature_begin_where_they_should():
+    assert make_cql(cql_weight=1000.0, gap_threshold=1.0).cql_weight.item() == 1000.0
+    for function, inverse in TEMPERATURES.values():
+        for value in (1e-3, 1.0, 1000.0):
+            assert function(torch.tensor(inverse(value)).double()).item() == pytest.approx(value)
+
+
 def test_bad_options_are_refused():
     for kwargs, message in (
         ({"cql_weight": -1.0}, "Expected cql_weight >= 0"),
+        ({"cql_weight": 0.0, "gap_threshold": 1.0}, "Expected cql_weight > 0"),
         ({"num_actions": 0}, "Expected num_actions >= 1"),
         ({"num_backup_actions": 0}, "Expected num_backup_actions >= 1"),
         ({"subset_size": 5}, "subset_size must be from 1"),

@@ -387,6 +387,9 @@ def test_what_a_loss_cannot_work_with_is_told():
         QSMLoss(policy, reward_scale=0.0)
     with pytest.raises(ValueError, match="num_target_candidates >= 1"):
         QSMLoss(policy, num_target_candidates=0)
+    sees_levels = make_diffusion_policy(chain=list(LANGEVIN))
+    with pytest.raises(ValueError, match='expected a network .* got embedding="mlp"'):
+        QSMLoss(sees_levels)
     without = DiffusionPolicy(NoiseNetwork(3, 2), NoiseSchedule.vp(20))
     with pytest.raises(ValueError, match="must have critics"):
         QSMLoss(without)

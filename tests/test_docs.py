@@ -307,3 +307,10 @@ def test_formulas_need_no_network(tmp_path):
     scripts = re.findall(r'<script[^>]* src="([^"?]+)', (built / "index.html").read_text())
     assert any("mathjax" in script for script in scripts)
     assert [script for script in scripts if not (built / script).is_file()] == []
+
+
+def test_commands_of_benchmarks_find_the_recipes():
+    for page in [*PAGES, *sorted((ROOT / "results").glob("*.md"))]:
+        for before, script in re.findall(r"(\S*) ?python benchmarks/(\w+\.py)", page.read_text()):
+            assert (ROOT / "benchmarks" / script).exists()
+            assert before.lstrip("`(") == "PYTHONPATH=recipes", f"{name_of(page)}: {script}"

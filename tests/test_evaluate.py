@@ -89,6 +89,8 @@ def test_a_finished_run_is_filmed_after_rendering_has_failed_once(runs, monkeypa
     assert made == [("video_best.mp4", 51)]  # an episode of Reacher has 50 steps
     assert len(rows_of(runs[0] / "evaluations.csv")) == rows + 1
     assert "video: " in capsys.readouterr().out
+    evaluated(f"run={runs[0]}", "episodes=2", "video=true", "max_steps=4")
+    assert made[1:] == [("video_9.mp4", 5)]
 
 
 @pytest.mark.parametrize(

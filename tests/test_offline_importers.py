@@ -53,6 +53,13 @@ def write_d4rl(path: Path, episodes=EPISODES, *, without=(), **replaced) -> Path
     return path
 
 
+@pytest.mark.parametrize(("module", "importer"), [("h5py", import_d4rl), ("minari", import_minari)])
+def test_a_missing_extra_is_told(module, importer, monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(DatasetError, match=rf"needs {module}: pip install 'torchrl-aca\[offline"):
+        importer(tmp_path / "source", tmp_path / "here")
+
+
 @pytest.fixture
 def source(tmp_path: Path) -> Path:
     return write_d4rl(tmp_path / "halfcheetah_test-v2.hdf5")

@@ -291,7 +291,10 @@ def test_such_a_run_is_resumed_without_the_other(trained, data, watch, tmp_path)
     stopped = run_o2o(*typed[:-2], f"run_dir={tmp_path / 'here'}", typed[-1])
     shutil.rmtree(source)
     watch()
+    by_command = shutil.copytree(stopped, tmp_path / "again")
     assert_same_state(whole, run_o2o(f"resume={stopped}"))
+    typed = [*typed[:-2], f"run_dir={by_command}", typed[-1], "existing=resume"]
+    assert_same_state(whole, run_o2o(*typed))  # whatever offline_updates is here
 
 
 def test_wsrl_needs_no_data_when_it_is_pretrained(trained, tmp_path):

@@ -107,6 +107,9 @@ def test_an_offline_phase_is_below_zero_and_at_no_frame(tmp_path):
     spec = {"name": "data", "tasks": {"Hopper-v4": []}, "methods": {"iql": []}}
     OmegaConf.save(spec, study / "study.yaml")
     run_dir = study / "Hopper-v4-iql-s0"
+    config = OmegaConf.load(run_dir / "config.yaml")
+    config.optim = {"offline_updates": 40}
+    OmegaConf.save(config, run_dir / "config.yaml")
     (run_dir / "eval.csv").write_text(
         "updates,frames,offline_updates,return_mean,return_std,num_episodes,normalized_score\n"
         "0,0,0,5,1,10,0.5\n0,0,40,50,1,10,5\n20,60,40,100,1,10,10\n"
@@ -120,6 +123,9 @@ def test_an_offline_phase_is_below_zero_and_at_no_frame(tmp_path):
     (run_dir / "eval.csv").write_text(with_own_phase.replace("0,0,0,5,1,10,0.5\n", ""))
     rows = evaluations.read_study(study)  # as of a run that began with another one's phase
     assert [(row["updates"], row["seconds"]) for row in rows] == [(0, 8.0), (20, 30.0)]
+    (run_dir / "eval.csv").write_text(with_own_phase.partition("0,0,40")[0] + "0,0,20,9,1,10,1\n")
+    rows = evaluations.read_study(study)  # as of a run that is in the middle of the phase
+    assert [row["updates"] for row in rows] == [-40, -20]
     (run_dir / "eval.csv").write_text(with_own_phase)
     options = ["--x", "frames", "--value", "normalized_score", "--at", "0", "60"]
     line = ["--line", "Hopper-v4:data=7.5"]

@@ -98,7 +98,8 @@ def test_each_task_has_a_panel_and_frames_may_be_the_axis(plot, tmp_path, monkey
 
 
 def test_updates_of_an_offline_phase_come_before_zero(plot, tmp_path):
-    run_dir = write_run(tmp_path / "a", {0: 1.0})
+    optim = {"utd_ratio": 1, "offline_updates": 20}
+    run_dir = write_run(tmp_path / "a", {0: 1.0}, optim=optim)
     rows = ["updates,offline_updates,return_mean,return_std", "0,0,1,0", "0,20,2,0", "10,20,3,0"]
     (run_dir / "eval.csv").write_text("\n".join(rows))
     (curve,) = plot.make_curves([run_dir])
@@ -138,3 +139,35 @@ def test_cards_are_what_their_command_prints(card, tmp_path):
     assert written == text
     assert (copy / "evaluations.csv").read_text() == (card.parent / "evaluations.csv").read_text()
     assert "## Notes" in text
+
+
+# --- what a shorter chain costs -------------------------------------------------------------------
+
+
+def test_the_three_sources_of_the_figure_of_short_chains(tmp_path):
+    import short_chains
+
+    case = (
+        "| HalfCheetah: update, {} target candidates, chain of {} levels | compiled | {} ms |  | |"
+    )
+    measured = ((1, 20, 90.5), (1, 6, 31.0), (4, 20, 300.0))
+    table = "\n".join(case.format(*numbers) for numbers in measured)
+    assert short_chains.costs(table) == {"N = 1": {20: 90.5, 6: 31.0}, "N = 4": {20: 300.0}}
+
+    header = "task,updates,schedule,num_steps,normalized,spacing,gradients,std_ratio\n"
+    rows = (
+        "Hopper-v4,2000,cosine,20,True,all,19,0.99\nHopper-v4,2000,cosine,20,True,quartic,9,1.01\n"
+        "Hopper-v4,2000,cosine,20,True,even,9,2.0\nHopper-v4,2000,cosine,20,False,quartic,9,3.0\n"
+        "Hopper-v4,2000,vp,20,True,quartic,9,4.0\nHopper-v4,2000,cosine,50,True,quartic,9,5.0\n"
+    )
+    (tmp_path / "hopper").mkdir()
+    (tmp_path / "hopper/fidelity.csv").write_text(header + rows)
+    assert short_chains.spreads(tmp_path) == {"Hopper-v4, 2,000 updates": {20: 0.99, 10: 1.01}}
+
+    runs = [
+        {"task": "T", "method": f"levels{levels}_n1", "seed": seed, "updates": u, "return_mean": r}
+        for levels, seed, u, r in ((20, 0, 0, 1), (20, 0, 9, 5), (20, 1, 9, 7), (6, 0, 9, 4))
+    ]
+    assert short_chains.returns(runs, "T") == {"N = 1": {20: 6.0, 6: 4.0}}
+    with pytest.raises(SystemExit, match="nothing to draw for 'cost'"):
+        short_chains.draw(Figure().subplots(), "cost", "ms", {})

@@ -54,7 +54,7 @@ def test_a_study_of_the_other_recipe_has_its_keys(study):
 NUM_JOBS = {
     "tiny": 1 * 2 * 2,  # tasks, methods, seeds
     "table2": 6 * 7 * 5,
-    "short_chains": 2 * 7 * 1,
+    "short_chains": 2 * 9 * 2,
     "rivals_short": 1 * 7 * 1,
     "guidance_weight": 2 * 6 * 2,
     "num_steps": 2 * 5 * 2,

@@ -6,6 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from gymnasium.envs.mujoco.inverted_pendulum_v4 import InvertedPendulumEnv
 from torchrl.collectors import Collector
 from torchrl.modules import RandomPolicy
 
@@ -235,15 +236,26 @@ def test_wrong_keywords_and_wrappers_are_told(parts_env, section, message):
         make_env(Env.model_validate({"name": parts_env, **section}))
 
 
+class Goal(InvertedPendulumEnv):
+    """One of MuJoCo's, with a state beside the simulator's."""
+
+    def reset_model(self):
+        self.goal = self.np_random.uniform(-1, 1)
+        return super().reset_model()
+
+
 @pytest.mark.parametrize(
     ("name", "wrappers", "exact"),
     [
         ("Hopper-v4", [], True),
         ("Pendulum-v1", [], False),
         ("Hopper-v4", [{"name": "NormalizeReward"}], False),
+        ("Goal-v0", [], False),
     ],
 )
-def test_an_episode_goes_on_only_where_its_whole_state_is_known(name, wrappers, exact):
+def test_an_episode_goes_on_only_where_its_whole_state_is_known(name, wrappers, exact, monkeypatch):
+    spec = gym.envs.registration.EnvSpec("Goal-v0", Goal, max_episode_steps=100)
+    monkeypatch.setitem(gym.registry, "Goal-v0", spec)
     env = make_vector_env(Env.model_validate({"name": name, "wrappers": wrappers}), 1, seed=0)
     settings = CollectorSettings(num_envs=1, frames_per_batch=4, warmup_frames=4, warmup="random")
     collection = Collection(env, RandomPolicy(env.action_spec), settings)

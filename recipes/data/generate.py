@@ -94,6 +94,11 @@ def make_dataset(cfg: GeneratorConfig) -> OfflineDataset:
 
 def episodes_of(cfg: GeneratorConfig, env: gym.Env, source: Path | None) -> Iterator[Episode]:
     """The episodes of a tier, one after the other; `source` is the SAC run."""
+    if cfg.tier != "medium_replay" and env.spec.max_episode_steps is None:
+        raise DatasetError(
+            f"{cfg.env.name} has no time limit, so an episode might never end; expected one. "
+            "Register the task with max_episode_steps."
+        )
     if source is None:
         return rollouts(env, uniform_actions(env, cfg.seed), cfg.episodes, cfg.seed)
     if cfg.tier == "medium":

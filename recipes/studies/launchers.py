@@ -56,9 +56,16 @@ def run_job(job: Job, threads: int, stop: StopSignal | None = None) -> int:
 
 def run_local(settings: Local, jobs: Sequence[Job], threads: int, stop: StopSignal) -> Results:
     """On this machine; a signal is passed on to the jobs, which save."""
-    at_once = settings.jobs or max(1, len(os.sched_getaffinity(0)) // threads)
+    at_once = settings.jobs or max(1, _num_cores() // threads)
     with ThreadPoolExecutor(at_once) as pool:
         yield from _ended({pool.submit(run_job, job, threads, stop): job for job in jobs})
+
+
+def _num_cores() -> int:
+    """The processors that this process may use, where the system tells, or all."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def _ended(futures: dict[Future[int], Job]) -> Results:

@@ -15,7 +15,7 @@ from torchrl.data import Bounded
 from torchrl.modules import ProbabilisticActor
 
 from torchrl_aca.baselines.ensemble_sac import TEMPERATURES, EnsembleSACLoss
-from torchrl_aca.checks import check_at_least
+from torchrl_aca.checks import check_above, check_at_least
 
 __all__ = ["CalQLLoss", "EnsembleCQLLoss"]
 
@@ -138,6 +138,7 @@ class EnsembleCQLLoss(EnsembleSACLoss):
         if gap_threshold is None:
             self.register_buffer("_fixed_weight", like.new_tensor(cql_weight))
         else:
+            check_above(0, cql_weight=cql_weight)
             _, inverse = TEMPERATURES[self.temperature]
             self.raw_cql_weight = nn.Parameter(like.new_tensor(inverse(cql_weight)))
             self.loss_names = (*self.loss_names, "loss_cql_weight")

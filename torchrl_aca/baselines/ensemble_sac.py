@@ -24,7 +24,7 @@ __all__ = ["EnsembleSACLoss"]
 # The temperature as a function of its parameter, and the way back.
 TEMPERATURES: dict[str, tuple[Callable[[Tensor], Tensor], Callable[[float], float]]] = {
     "exp": (torch.exp, math.log),
-    "softplus": (nn.functional.softplus, lambda alpha: math.log(math.expm1(alpha))),
+    "softplus": (nn.functional.softplus, lambda alpha: alpha + math.log(-math.expm1(-alpha))),
 }
 
 

@@ -45,7 +45,7 @@ class QSMLoss(DiffusionPolicyLoss):
         kwargs: as of :class:`DiffusionPolicyLoss`.
 
     Raises:
-        ValueError: on an unknown option.
+        ValueError: on an unknown option, or Langevin steps with a network that sees the level.
 
     Examples:
         >>> from torchrl_aca.baselines import DiffusionPolicy, NoiseNetwork, QSMLoss, TwinCritic
@@ -69,6 +69,13 @@ class QSMLoss(DiffusionPolicyLoss):
         **kwargs: Any,
     ) -> None:
         super().__init__(actor_network, **kwargs)
+        embedding = getattr(actor_network.network, "embedding", "none")
+        if actor_network.schedule is None and embedding != "none":
+            raise ValueError(
+                "Langevin steps use one score at all levels, and this loss trains one: expected a "
+                f'network that does not see the level, got embedding="{embedding}". Build it with '
+                'embedding="none", or give the policy a NoiseSchedule.'
+            )
         check_above(0, score_scale=score_scale)
         check_choice(("min", "mean"), gradient_of=gradient_of)
         self.score_scale = score_scale

@@ -9,7 +9,7 @@ from typing import Any
 from torchrl_aca.errors import DatasetError
 from torchrl_aca.offline.arguments import as_scores
 from torchrl_aca.offline.dataset import OfflineDataset
-from torchrl_aca.offline.importing import provenance_of, reading, write_episodes
+from torchrl_aca.offline.importing import provenance_of, reading, require, write_episodes
 from torchrl_aca.offline.writer import DatasetWriter
 
 
@@ -70,7 +70,7 @@ def import_minari(
 
 
 def _open(source: str | Path) -> Any:
-    import minari
+    minari = require("minari")
 
     directory = Path(source)
     try:

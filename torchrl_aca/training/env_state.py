@@ -18,7 +18,8 @@ from gymnasium.wrappers import (
 )
 from torchrl.envs import GymWrapper
 
-# What may stand around a simulator without a state that `ResumableEnv` does not know.
+# What has no state but the simulator's, and what may stand around it without one of its own.
+_KNOWN_SIMULATORS = "gymnasium.envs.mujoco."
 _KNOWN_WRAPPERS = (
     DtypeObservation,
     FlattenObservation,
@@ -35,9 +36,10 @@ class ResumableEnv(gym.Wrapper):
     After `load_state_dict`, `reset` returns the restored observation until the first step is made,
     so a collector that resets its environments when it starts goes on with the saved episode.
 
-    The state is exact for MuJoCo environments. Other environments, and those with wrappers of the
-    user's choice, which may have a state of their own, keep their random stream but begin a new
-    episode, because Gymnasium has no general way to save them.
+    The state is exact for Gymnasium's own MuJoCo environments. Others, the user's subclasses of
+    these among them, and those with wrappers of the user's choice may have a state of their own:
+    they keep their random stream but begin a new episode, because Gymnasium has no general way to
+    save them.
     """
 
     def __init__(self, env: gym.Env) -> None:
@@ -91,8 +93,8 @@ class ResumableEnv(gym.Wrapper):
     @property
     def is_exact(self) -> bool:
         """Whether the state holds all that the next step follows from."""
-        simulated = isinstance(getattr(self.unwrapped, "data", None), mujoco.MjData)
-        return simulated and all(isinstance(layer, _KNOWN_WRAPPERS) for layer in self._layers())
+        known = type(self.unwrapped).__module__.startswith(_KNOWN_SIMULATORS)
+        return known and all(isinstance(layer, _KNOWN_WRAPPERS) for layer in self._layers())
 
     @property
     def time_limit(self) -> TimeLimit | None:

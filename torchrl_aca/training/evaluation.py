@@ -96,9 +96,23 @@ def evaluate(
 
 
 def record_video(
-    policy: Policy, task: str | Env, path: Path, seed: int, device: torch.device
+    policy: Policy,
+    task: str | Env,
+    path: Path,
+    seed: int,
+    device: torch.device,
+    *,
+    max_steps: int | None = None,
 ) -> None:
     """Renders one whole episode of the deterministic policy to an MP4 file.
+
+    Args:
+        policy: See `evaluate`.
+        task: See `make_env`.
+        path: The file.
+        seed: Of the environment and the policy's draws.
+        device: Device of the policy.
+        max_steps: Length after which the episode is cut. Default: the task's own.
 
     Raises:
         RunError: If this machine cannot render.
@@ -109,7 +123,8 @@ def record_video(
     try:
         import imageio
 
-        env = make_env(task, render_mode="rgb_array")
+        limit = {} if max_steps is None else {"max_episode_steps": max_steps}
+        env = make_env(task, render_mode="rgb_array", **limit)
         observation, _ = env.reset(seed=seed)
         images, done = [env.render()], False
         with evaluation_mode(seed):
@@ -139,5 +154,5 @@ def report_extras(
         print(f"a random policy on the same seeds: {result['return_mean']:.1f}")
     if cfg.video.enabled:
         path = run_dir / "video.mp4"
-        record_video(policy, cfg.env, path, cfg.eval.seed, device)
+        record_video(policy, cfg.env, path, cfg.eval.seed, device, max_steps=cfg.eval.max_steps)
         print(f"video: {path}")

@@ -45,7 +45,7 @@ def launch(train: Train, cfg: DictConfig) -> None:
     try:
         if is_job and cfg.run_dir is None:
             cfg.run_dir = hydra.runtime.output_dir
-        run_dir = _trained(train, cfg, hydra.overrides.task)
+        run_dir = start(train, cfg, hydra.overrides.task)
     except (DatasetError, RunError) as error:
         if is_job:  # Hydra raises it after the last job, and that of the first one alone
             print(f"error: {error}", file=sys.stderr)
@@ -58,7 +58,7 @@ def launch(train: Train, cfg: DictConfig) -> None:
         raise SystemExit(STOPPED)
 
 
-def _trained(train: Train, cfg: DictConfig, overrides: Iterable[str]) -> Path:
+def start(train: Train, cfg: DictConfig, overrides: Iterable[str]) -> Path:
     """Trains from where the run is, unless it is finished, and returns its directory."""
     if cfg.resume is not None:
         return train(*resumed_config(cfg, overrides))

@@ -64,6 +64,9 @@ def continued_config(cfg: DictConfig, stored: DictConfig) -> DictConfig:
         RunError: If the run is another one.
     """
     run = stored.copy()
+    if OmegaConf.select(run, "pretrained"):  # the offline updates are those of the other run
+        cfg = cfg.copy()
+        cfg.optim.offline_updates = run.optim.offline_updates
     require_equal(cfg, run, run, f"the command for run_dir={cfg.run_dir}")
     for key in MAY_CHANGE_ON_RESUME:
         value = OmegaConf.select(cfg, key)
