@@ -130,7 +130,15 @@ def test_mish_and_its_gradient_agree_with_pytorchs(dtype, tolerance):
     torch.testing.assert_close(slope.double(), expected_slope, rtol=tolerance, atol=tolerance)
 
 
-@pytest.mark.parametrize("activation", [nn.Mish(), nn.Tanh()])
+def test_relu_and_its_gradient_by_hand():
+    x = tensor(-2.0, 0.0, 3.0).requires_grad_()
+    value = F.relu(x)
+    close(value.detach(), tensor(0.0, 0.0, 3.0))
+    (slope,) = torch.autograd.grad(value, x, tensor(5.0, 5.0, 5.0))
+    close(slope, tensor(0.0, 0.0, 5.0))  # at 0 as PyTorch's own
+
+
+@pytest.mark.parametrize("activation", [nn.Mish(), nn.ReLU(), nn.Tanh()])
 def test_an_activation_is_the_same_compiled_and_not(activation):
     x = torch.linspace(-5, 5, 101, dtype=torch.float64).requires_grad_()
     compiled = torch.compile(F.activate, fullgraph=True)(activation, x)

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from torchrl_aca import functional as F
 from torchrl_aca.stacked import StackedLinear
 
 __all__ = ["EnsembleMLP"]
@@ -78,7 +79,9 @@ class EnsembleMLP(nn.Module):
         x = torch.cat(inputs, -1)
         weight = self.weights[0]
         rows = x.reshape(-1, x.shape[-1]).expand(weight.shape[0], -1, -1)
-        return self.layers(rows).squeeze(-1).mT.reshape(*x.shape[:-1], weight.shape[0])
+        for layer in self.layers:
+            rows = F.activate(layer, rows) if isinstance(layer, nn.ReLU) else layer(rows)
+        return rows.squeeze(-1).mT.reshape(*x.shape[:-1], weight.shape[0])
 
 
 def _xavier_uniform(weight: Tensor, num_in: int) -> None:
