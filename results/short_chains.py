@@ -23,14 +23,14 @@ CASE = r"\| HalfCheetah: update, (\d+) target candidates, chain of (\d+) levels 
 COST = re.compile(CASE + r"\| ([\d.]+) ms")
 PAPER = ("cosine", "20", "True")
 METHOD = re.compile(r"levels(\d+)_n(\d+)")
-Points = dict[str, dict[int, float]]  # of each line, by the number of levels
+Points = dict[str, dict[int, list[float]]]  # of each line, by the number of levels
 
 
 def costs(table: str) -> Points:
     """Milliseconds of an update, by N."""
     found: Points = {}
     for candidates, levels, time in COST.findall(table):
-        found.setdefault(f"N = {candidates}", {})[int(levels)] = float(time)
+        found.setdefault(f"N = {candidates}", {})[int(levels)] = [float(time)]
     return found
 
 
@@ -48,12 +48,12 @@ def spreads(folder: Path) -> Points:
             paper = (row["schedule"], row["num_steps"], row["normalized"]) == PAPER
             if paper and row["spacing"] in ("quartic", "all"):
                 label = f"{row['task']}, {int(row['updates']):,} updates"
-                found.setdefault(label, {})[int(row["gradients"]) + 1] = float(row["std_ratio"])
+                found.setdefault(label, {})[int(row["gradients"]) + 1] = [float(row["std_ratio"])]
     return found
 
 
 def returns(rows: list[Row], task: str) -> Points:
-    """Mean returns over seeds where all runs of the task were evaluated last, by N."""
+    """Returns of the seeds where all runs of the task were evaluated last, by N."""
     rows = viewed(rows, "updates", "return_mean")
     place = last_shared(rows, task)
     found: Points = {}
@@ -61,17 +61,19 @@ def returns(rows: list[Row], task: str) -> Points:
         values = values_at(rows, task, method, place)
         if len(values):
             levels, candidates = METHOD.fullmatch(method).groups()
-            found.setdefault(f"N = {candidates}", {})[int(levels)] = float(np.mean(values))
+            found.setdefault(f"N = {candidates}", {})[int(levels)] = values.tolist()
     return found
 
 
 def draw(axes: Axes, title: str, ylabel: str, points: Points) -> None:
-    """A line for each entry."""
+    """A line through the means of each entry, and a point for each value."""
     if not points:
         raise SystemExit(f"error: nothing to draw for {title!r}. Run what measures it first.")
     for label, line in points.items():
         levels = sorted(line)
-        axes.plot(levels, [line[level] for level in levels], marker="o", markersize=4, label=label)
+        (drawn,) = axes.plot(levels, [np.mean(line[level]) for level in levels], label=label)
+        for level in levels:
+            axes.plot([level] * len(line[level]), line[level], "o", ms=4, color=drawn.get_color())
     axes.set(title=title, xlabel="levels that the chain visits", ylabel=ylabel)
     axes.set_xticks(sorted({level for line in points.values() for level in line}))
     axes.grid(alpha=0.3)
@@ -86,7 +88,6 @@ def main() -> None:
     cost, fidelity, *panels = figure.subplots(1, 2 + len(tasks))
     table = (HERE / "speed.md").read_text()
     draw(cost, "cost", "update, ms", costs(table))
-    cost.set_ylim(bottom=0)
     draw(
         fidelity,
         "fidelity",
@@ -95,6 +96,8 @@ def main() -> None:
     )
     for task, axes in zip(tasks, panels, strict=True):
         draw(axes, f"return, {task}", "evaluation return", returns(rows, task))
+    for axes in (cost, *panels):
+        axes.set_ylim(bottom=0)
     figure.savefig(HERE / "short_chains/trade.png", dpi=110)
 
 

@@ -152,7 +152,7 @@ def test_the_three_sources_of_the_figure_of_short_chains(tmp_path):
     )
     measured = ((1, 20, 90.5), (1, 6, 31.0), (4, 20, 300.0))
     table = "\n".join(case.format(*numbers) for numbers in measured)
-    assert short_chains.costs(table) == {"N = 1": {20: 90.5, 6: 31.0}, "N = 4": {20: 300.0}}
+    assert short_chains.costs(table) == {"N = 1": {20: [90.5], 6: [31.0]}, "N = 4": {20: [300.0]}}
 
     header = "task,updates,schedule,num_steps,normalized,spacing,gradients,std_ratio\n"
     rows = (
@@ -162,12 +162,12 @@ def test_the_three_sources_of_the_figure_of_short_chains(tmp_path):
     )
     (tmp_path / "hopper").mkdir()
     (tmp_path / "hopper/fidelity.csv").write_text(header + rows)
-    assert short_chains.spreads(tmp_path) == {"Hopper-v4, 2,000 updates": {20: 0.99, 10: 1.01}}
+    assert short_chains.spreads(tmp_path) == {"Hopper-v4, 2,000 updates": {20: [0.99], 10: [1.01]}}
 
     runs = [
         {"task": "T", "method": f"levels{levels}_n1", "seed": seed, "updates": u, "return_mean": r}
         for levels, seed, u, r in ((20, 0, 0, 1), (20, 0, 9, 5), (20, 1, 9, 7), (6, 0, 9, 4))
     ]
-    assert short_chains.returns(runs, "T") == {"N = 1": {20: 6.0, 6: 4.0}}
+    assert short_chains.returns(runs, "T") == {"N = 1": {20: [5.0, 7.0], 6: [4.0]}}
     with pytest.raises(SystemExit, match="nothing to draw for 'cost'"):
         short_chains.draw(Figure().subplots(), "cost", "ms", {})
