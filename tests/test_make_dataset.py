@@ -9,9 +9,11 @@ import signal
 import time
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from gymnasium.envs.registration import EnvSpec
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
@@ -290,6 +292,14 @@ def test_mistakes_leave_nothing(tmp_path, overrides, error, message):
     overrides = [override.format(tmp_path) for override in overrides]
     with pytest.raises(error, match=message):
         made(*tiny, *overrides)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_task_without_a_time_limit_is_refused(tmp_path, monkeypatch):
+    entry = "gymnasium.envs.mujoco.hopper_v4:HopperEnv"
+    monkeypatch.setitem(gym.registry, "Endless-v0", EnvSpec("Endless-v0", entry))
+    with pytest.raises(DatasetError, match="Endless-v0 has no time limit"):
+        generate("random", tmp_path, "env.name=Endless-v0")
     assert not list(tmp_path.iterdir())
 
 
