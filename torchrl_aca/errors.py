@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-__all__ = ["DatasetError", "RunError"]
+from importlib import import_module
+from types import ModuleType
+
+__all__ = ["DatasetError", "RunError", "require"]
 
 
 class RunError(ValueError):
@@ -11,3 +14,13 @@ class RunError(ValueError):
 
 class DatasetError(ValueError):
     """Data cannot be stored, imported or loaded: says what was expected, what was got, the fix."""
+
+
+def require(
+    module: str, user: str, extra: str, error: type[RunError | DatasetError] = RunError
+) -> ModuleType:
+    """Imports what `user` alone needs; where it is missing, `error` names the extra that has it."""
+    try:
+        return import_module(module)
+    except ImportError as missing:
+        raise error(f"{user} needs {module}: pip install 'torchrl-aca[{extra}]'") from missing

@@ -10,13 +10,12 @@ import os
 import subprocess
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
-from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from studies.jobs import Job, Local, Ray, StudyConfig, Submitit, study_dir
-from torchrl_aca.errors import RunError
+from torchrl_aca.errors import require
 from torchrl_aca.training.signals import STOPPED, StopSignal, run_command
 
 RECIPES = Path(__file__).parents[1]
@@ -73,13 +72,6 @@ def _ended(futures: dict[Future[int], Job]) -> Results:
         yield futures[future], future.result()
 
 
-def _required(module: str, launcher: str) -> ModuleType:
-    try:
-        return import_module(module)
-    except ImportError as error:
-        raise RunError(f"launcher={launcher} needs {module}: pip install {module}") from error
-
-
 class SubmittedJob:
     """A job in submitit's process; when its time is over it is told to save, and comes again."""
 
@@ -96,13 +88,17 @@ class SubmittedJob:
         """Called by submitit, in its handler of the signal."""
         self.stop.received = "SIGUSR2"
         self.future.result()
-        submission = _required("submitit.helpers", "submitit").DelayedSubmission
+        submission = require(
+            "submitit.helpers", "launcher=submitit", "distributed"
+        ).DelayedSubmission
         return submission(SubmittedJob(self.job, self.threads))
 
 
 def submit(settings: Submitit, jobs: Sequence[Job], threads: int, folder: Path) -> Results:
     """Hands the jobs to submitit and leaves; `status=true` tells how far they are."""
-    executor = _required("submitit", "submitit").AutoExecutor(folder, cluster=settings.cluster)
+    executor = require("submitit", "launcher=submitit", "distributed").AutoExecutor(
+        folder, cluster=settings.cluster
+    )
     executor.update_parameters(timeout_min=settings.timeout_min, cpus_per_task=threads)
     executor.update_parameters(**settings.parameters)
     with executor.batch():
@@ -123,7 +119,7 @@ def _run_or_raise(job: Job, threads: int) -> int:
 
 def run_ray(settings: Ray, jobs: Sequence[Job], threads: int, stop: StopSignal) -> Results:
     """On Ray; a job that fails or is killed is tried again, and goes on from its checkpoint."""
-    ray = _required("ray", "ray")
+    ray = require("ray", "launcher=ray", "distributed")
     environment = {"env_vars": {"PYTHONPATH": os.environ["PYTHONPATH"]}}
     ray.init(address=settings.address, runtime_env=environment, log_to_driver=False)
     retries = {"max_retries": settings.retries, "retry_exceptions": [FailedJobError]}

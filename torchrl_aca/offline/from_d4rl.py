@@ -8,10 +8,10 @@ from typing import Any
 
 import torch
 
-from torchrl_aca.errors import DatasetError
+from torchrl_aca.errors import DatasetError, require
 from torchrl_aca.offline.arguments import as_scores
 from torchrl_aca.offline.dataset import OfflineDataset
-from torchrl_aca.offline.importing import provenance_of, reading, require, write_episodes
+from torchrl_aca.offline.importing import provenance_of, reading, write_episodes
 from torchrl_aca.offline.scores import reference_scores as known_scores
 from torchrl_aca.offline.writer import DatasetWriter
 
@@ -60,7 +60,7 @@ def import_d4rl(
         DatasetError: If the file has another layout or cannot be read to its end, or the data fail
             a check. Nothing is at `path` then.
     """
-    h5py = require("h5py")
+    h5py = require("h5py", "import_d4rl", "offline", DatasetError)
 
     scores = known_scores(env_id) if reference_scores is None else reference_scores
     as_scores(scores)  # before the work

@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from torchrl_aca.errors import DatasetError
+from torchrl_aca.errors import DatasetError, require
 from torchrl_aca.offline.arguments import as_scores
 from torchrl_aca.offline.dataset import OfflineDataset
-from torchrl_aca.offline.importing import provenance_of, reading, require, write_episodes
+from torchrl_aca.offline.importing import provenance_of, reading, write_episodes
 from torchrl_aca.offline.writer import DatasetWriter
 
 
@@ -70,7 +70,7 @@ def import_minari(
 
 
 def _open(source: str | Path) -> Any:
-    minari = require("minari")
+    minari = require("minari", "import_minari", "offline", DatasetError)
 
     directory = Path(source)
     try:

@@ -4,25 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 from torchrl_aca.errors import DatasetError
 from torchrl_aca.offline.layout import sha256
 from torchrl_aca.offline.writer import DatasetWriter
-
-
-def require(module: str) -> ModuleType:
-    """Imports what only an importer needs."""
-    try:
-        return import_module(module)
-    except ImportError as error:
-        raise DatasetError(
-            f"this import needs {module}: pip install 'torchrl-aca[offline]'"
-        ) from error
 
 
 def write_episodes(

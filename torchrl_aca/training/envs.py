@@ -21,7 +21,7 @@ from torchrl_aca.training.config import Env, Wrapper
 from torchrl_aca.training.env_state import ResumableEnv
 
 
-def make_env(task: str | Env, **kwargs: Any) -> gym.Env:
+def make_env(task: str | Env, *, max_steps: int | None = None, **kwargs: Any) -> gym.Env:
     """Builds one Gymnasium environment with a flat float32 observation.
 
     An observation of several parts (a `Dict`, a `Tuple`) becomes one vector of all of them, in the
@@ -30,6 +30,7 @@ def make_env(task: str | Env, **kwargs: Any) -> gym.Env:
     Args:
         task: A Gymnasium id; "module:Id-v0" imports the module first. Or the section `env` of a
             configuration, with keywords and wrappers.
+        max_steps: Length after which an episode is cut. Default: the task's own.
         **kwargs: More keywords for `gymnasium.make`.
 
     Raises:
@@ -37,6 +38,8 @@ def make_env(task: str | Env, **kwargs: Any) -> gym.Env:
             vector of numbers with finite action bounds.
     """
     task = Env(name=task) if isinstance(task, str) else task
+    if max_steps is not None:
+        kwargs["max_episode_steps"] = max_steps
     try:
         with _quiet_construction():
             env = gym.make(task.name, **{**(task.kwargs or {}), **kwargs})
@@ -87,13 +90,12 @@ def make_vector_env(
         task: See `make_env`.
         num_envs: Number of environments; the batch size of the result is (num_envs,).
         seed: They are seeded with seed, seed + 1, ...
-        max_steps: Length after which an episode is cut. Default: the task's own.
+        max_steps: See `make_env`.
 
     Raises:
         RunError: See `make_env`.
     """
-    limit = {} if max_steps is None else {"max_episode_steps": max_steps}
-    members = [lambda: ResumableEnv(make_env(task, **limit))] * num_envs
+    members = [lambda: ResumableEnv(make_env(task, max_steps=max_steps))] * num_envs
     env = GymWrapper(SyncVectorEnv(members, autoreset_mode=AutoresetMode.DISABLED))
     env.set_seed(seed)
     return env

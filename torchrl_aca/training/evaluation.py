@@ -112,7 +112,7 @@ def record_video(
         path: The file.
         seed: Of the environment and the policy's draws.
         device: Device of the policy.
-        max_steps: Length after which the episode is cut. Default: the task's own.
+        max_steps: See `make_env`.
 
     Raises:
         RunError: If this machine cannot render.
@@ -123,8 +123,7 @@ def record_video(
     try:
         import imageio
 
-        limit = {} if max_steps is None else {"max_episode_steps": max_steps}
-        env = make_env(task, render_mode="rgb_array", **limit)
+        env = make_env(task, max_steps=max_steps, render_mode="rgb_array")
         observation, _ = env.reset(seed=seed)
         images, done = [env.render()], False
         with evaluation_mode(seed):
