@@ -56,9 +56,9 @@ NUM_JOBS = {
     "table2": 6 * 7 * 5,
     "short_chains": 2 * 9 * 2,
     "rivals_short": 1 * 7 * 1,
-    "guidance_weight": 2 * 6 * 2,
+    "guidance_weight": 2 * 10 * 2,
     "num_steps": 2 * 5 * 2,
-    "beyond": 2 * 8 * 2,
+    "beyond": 2 * 3 * 2,
     "offline_to_online": 2 * 7 * 2,
 }
 
