@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from bisect import bisect_right
 from collections.abc import Sequence
 from itertools import product
@@ -157,6 +158,21 @@ def values_at(rows: Sequence[Row], task: str, method: str, place: float) -> np.n
     """The value of each seed that was evaluated at a place."""
     runs = by_seed(rows, task, method).values()
     return np.array([run[place] for run in runs if place in run])
+
+
+def by_setting(rows: Sequence[Row], task: str, method: str) -> dict[str, dict[int, list[float]]]:
+    """The values of all seeds where all runs of a task were evaluated last, by line and setting.
+
+    `method` is a pattern of the methods' names with groups `line` and `setting`, a number.
+    """
+    rows, found = viewed(rows, "updates", "return_mean"), {}
+    place = last_shared(rows, task)
+    for name in names(rows, "method"):
+        values = values_at(rows, task, name, place)
+        if len(values) and (match := re.fullmatch(method, name)):
+            line = found.setdefault(match["line"], {})
+            line[int(match["setting"])] = values.tolist()
+    return found
 
 
 def before_training(rows: Sequence[Row], task: str) -> float:

@@ -1,11 +1,13 @@
-"""Figures over all tasks of a study: values with intervals, and performance profiles."""
+"""Figures of a study: values with intervals, performance profiles, and values by a setting."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from evaluations import Scores
@@ -45,3 +47,15 @@ def draw_profiles(found: Scores, path: Path) -> None:
     axes.grid(alpha=0.3)
     axes.legend(frameon=False)
     figure.savefig(path, dpi=120)
+
+
+def draw_settings(axes: Axes, lines: Mapping[str, Mapping[int, Sequence[float]]]) -> None:
+    """A line through the means at each setting, and a point for each value."""
+    for label, values in lines.items():
+        settings = sorted(values)
+        (drawn,) = axes.plot(settings, [np.mean(values[x]) for x in settings], label=label)
+        for x in settings:
+            axes.plot([x] * len(values[x]), values[x], "o", ms=4, color=drawn.get_color())
+    axes.set_xticks(sorted({x for values in lines.values() for x in values}))
+    axes.grid(alpha=0.3)
+    axes.legend(frameon=False, fontsize="small")

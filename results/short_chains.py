@@ -12,17 +12,17 @@ import csv
 import re
 from pathlib import Path
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from evaluations import Row, last_shared, names, read_study, values_at, viewed
+from evaluations import by_setting, names, read_study
+from figures import draw_settings
 
 HERE = Path(__file__).parent
 CASE = r"\| HalfCheetah: update, (\d+) target candidates, chain of (\d+) levels \| compiled "
 COST = re.compile(CASE + r"\| ([\d.]+) ms")
 PAPER = ("cosine", "20", "True")
-METHOD = re.compile(r"levels(\d+)_n(\d+)")
+METHOD = r"levels(?P<setting>\d+)_(?P<line>n\d+)"
 Points = dict[str, dict[int, list[float]]]  # of each line, by the number of levels
 
 
@@ -52,32 +52,12 @@ def spreads(folder: Path) -> Points:
     return found
 
 
-def returns(rows: list[Row], task: str) -> Points:
-    """Returns of the seeds where all runs of the task were evaluated last, by N."""
-    rows = viewed(rows, "updates", "return_mean")
-    place = last_shared(rows, task)
-    found: Points = {}
-    for method in names(rows, "method"):
-        values = values_at(rows, task, method, place)
-        if len(values):
-            levels, candidates = METHOD.fullmatch(method).groups()
-            found.setdefault(f"N = {candidates}", {})[int(levels)] = values.tolist()
-    return found
-
-
 def draw(axes: Axes, title: str, ylabel: str, points: Points) -> None:
-    """A line through the means of each entry, and a point for each value."""
+    """A panel of values by the number of levels."""
     if not points:
         raise SystemExit(f"error: nothing to draw for {title!r}. Run what measures it first.")
-    for label, line in points.items():
-        levels = sorted(line)
-        (drawn,) = axes.plot(levels, [np.mean(line[level]) for level in levels], label=label)
-        for level in levels:
-            axes.plot([level] * len(line[level]), line[level], "o", ms=4, color=drawn.get_color())
+    draw_settings(axes, points)
     axes.set(title=title, xlabel="levels that the chain visits", ylabel=ylabel)
-    axes.set_xticks(sorted({level for line in points.values() for level in line}))
-    axes.grid(alpha=0.3)
-    axes.legend(frameon=False, fontsize="small")
 
 
 def main() -> None:
@@ -95,7 +75,8 @@ def main() -> None:
         spreads(HERE / "chain_fidelity"),
     )
     for task, axes in zip(tasks, panels, strict=True):
-        draw(axes, f"return, {task}", "evaluation return", returns(rows, task))
+        lines = {f"N = {n[1:]}": line for n, line in by_setting(rows, task, METHOD).items()}
+        draw(axes, f"return, {task}", "evaluation return", lines)
     for axes in (cost, *panels):
         axes.set_ylim(bottom=0)
     figure.savefig(HERE / "short_chains/trade.png", dpi=110)

@@ -67,6 +67,24 @@ def write_run(folder: Path, method: str, seed: int, returns: dict[int, float], t
     (run_dir / "versions.json").write_text(json.dumps(versions))
 
 
+def test_values_by_setting_are_of_the_last_evaluation_that_all_runs_have():
+    runs = [
+        ("Hopper-v4", "w5", 0, {0: 0, 10: 1, 20: 7}),
+        ("Hopper-v4", "w5", 1, {0: 0, 10: 2}),
+        ("Hopper-v4", "w50", 0, {0: 0, 10: 3}),
+        ("Hopper-v4", "auto5", 0, {0: 0, 10: 4}),
+        ("Hopper-v4", "soft", 0, {0: 0, 10: 5}),  # has no setting
+        ("Reacher-v4", "w5", 0, {0: 0, 20: 9}),
+    ]
+    rows = [
+        {"task": task, "method": method, "seed": seed, "updates": place, "return_mean": value}
+        for task, method, seed, returns in runs
+        for place, value in returns.items()
+    ]
+    found = evaluations.by_setting(rows, "Hopper-v4", r"(?P<line>w|auto)(?P<setting>\d+)")
+    assert found == {"w": {5: [1, 2], 50: [3]}, "auto": {5: [4]}}
+
+
 @pytest.fixture
 def study(tmp_path) -> Path:
     folder = tmp_path / "study"
