@@ -22,6 +22,7 @@ from omegaconf import DictConfig
 import help_text  # noqa: F401
 import renderer  # noqa: F401
 from agents import configured, make_agent
+from agents.pretrained import refuse_offline_phase
 from torchrl_aca.replay import make_replay_buffer
 from torchrl_aca.training.envs import make_vector_env
 from torchrl_aca.training.evaluation import evaluate, make_eval_env, report_extras
@@ -35,6 +36,7 @@ from torchrl_aca.training.workers import make_collection
 def train(cfg: DictConfig, checkpoint: dict[str, Any] | None = None) -> Path:
     """Trains one agent, from the start or from a checkpoint, and returns the run directory."""
     cfg = configured(cfg)
+    refuse_offline_phase(cfg)
     require_wandb_login(cfg.logger)
     device = make_device(cfg)
     seed_everything(cfg.seed)

@@ -8,6 +8,7 @@ import math
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.data import Bounded
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from agents import AGENTS, configured, make_agent
@@ -21,6 +22,7 @@ from recipe_cases import (
     rows_of,
     without_time,
 )
+from torchrl_aca.baselines import make_gaussian_policy
 from torchrl_aca.training.envs import make_vector_env
 from torchrl_aca.training.resume import resumed_config
 
@@ -80,7 +82,7 @@ BANDIT = {
     ],
     "qvpo": ["optim.lr=1e-2", "optim.actor_lr=1e-2", "qvpo.num_candidates=32"],
     "rlpd": ["optim.lr=1e-2", "optim.actor_lr=1e-2", "rlpd.alpha_init=0.3"],
-    "sac": ["optim.lr=1e-2", "sac.alpha_init=0.3", "sac.reward_scale=1"],
+    "sac": ["optim.lr=1e-2", "sac.num_cells=[64,64]", "sac.alpha_init=0.3", "sac.reward_scale=1"],
     "sdac": ["optim.lr=1e-2", "optim.actor_lr=1e-2", "sdac.num_candidates=32"],
     "cql": [*CQL_BANDIT, "cql.gap_threshold=null"],
     "calql": CQL_BANDIT,
@@ -218,6 +220,50 @@ def test_the_entropy_target_is_meant_for_actions_between_minus_one_and_one(algo)
     # TorchRL's loss measures in env units, ours in [-1, 1]: their targets differ by the Jacobian.
     jacobian = {"sac": 17 * torch.tensor(0.4).log().item(), "rlpd": 0.0}[algo]
     assert float(target) == pytest.approx(-17 * scale + jacobian, abs=1e-4)
+
+
+def test_without_the_squash_correction_sac_scores_what_is_squashed():
+    loss = built("sac", "sac.squash_correction=false", env="humanoid", tiny=False).state["loss"]
+    assert float(loss.target_entropy) == -17  # of a Gaussian without units
+    spec = Bounded(-0.4, 0.4, shape=(2,))
+    policy = make_gaussian_policy(3, spec, squash_correction=False).double()
+    dist = policy.get_dist(TensorDict(observation=torch.randn(5, 3).double(), batch_size=[5]))
+    gaussian = torch.distributions.Normal(dist.loc, dist.scale)
+    for draw in (dist.rsample_and_log_prob, dist.sample_and_log_prob):
+        action, score = draw()
+        assert action.requires_grad == (draw == dist.rsample_and_log_prob)
+        expected = gaussian.log_prob((action / 0.4).atanh()).sum(-1)
+        torch.testing.assert_close(score, expected)
+        torch.testing.assert_close(dist.log_prob(action), expected)
+
+
+def test_sacs_policy_learns_from_the_critics_of_the_same_update(monkeypatch):
+    agent = built("sac")
+    loss, seen = agent.state["loss"], []
+    original, critics = loss.actor_loss, loss.qvalue_network_params
+
+    def watched(data):
+        seen.append(critics.detach().clone())
+        return original(data)
+
+    monkeypatch.setattr(loss, "actor_loss", watched)
+    before = critics.detach().clone()
+    agent.update(batch_of(0))
+    assert (seen[0] == critics).all() and not (seen[0] == before).all()
+
+
+def test_sac_begins_with_the_weights_of_the_other_methods():
+    loss = built("sac", env="humanoid", tiny=False).state["loss"]
+    values = dict(loss.named_parameters())
+    weights = [p for name, p in values.items() if name.endswith("weight")]
+    biases = [p for name, p in values.items() if name.endswith("bias")]
+    assert len(weights) == len(biases) == 2 * 4  # actor and stacked critics
+    for weight in weights:
+        share = weight.std() * weight.shape[-1] ** 0.5
+        assert 0.8 < share < 0.95  # 0.88, of a normal that is cut at two deviations
+    assert not any(bias.any() for bias in biases)
+    critics = next(weight for weight in weights if weight.ndim == 3)
+    assert not torch.equal(critics[0], critics[1])
 
 
 @pytest.mark.parametrize(

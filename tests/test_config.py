@@ -143,8 +143,7 @@ BESIDE = [
     ("algo=wsrl", "wsrl.actor_interval=0", "wsrl.actor_interval=0: expected greater than"),
     ("algo=iql", "iql.expectile=1", "iql.expectile=1: expected less than 1"),
     ("algo=iql", "iql.subset_size=11", r"at most iql.num_qvalue_nets \(10\)"),
-    ("algo=sac", "sac.activation=Foo", "sac.activation='Foo': expected the name of an activation"),
-    ("algo=sac", "sac.activation=functional", "sac.activation='functional'"),
+    ("algo=sac", "sac.activation=Foo", "sac.activation='Foo': expected 'Mish', 'ReLU' or 'GELU'"),
     ("algo=sac", "sac.num_cells=[0]", "sac.num_cells.0=0"),
     (
         "algo=sac",

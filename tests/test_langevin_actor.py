@@ -9,7 +9,7 @@ from torchrl.objectives import SoftUpdate
 
 import oracle
 from loss_cases import make_data, set_constant
-from torchrl_aca import ACALoss, NoiseLevelCritic
+from torchrl_aca import ACALoss, CriticGuidedDenoisingActor, NoiseLevelCritic, NoiseSchedule
 from torchrl_aca.interop import to_official
 from torchrl_aca.langevin_actor import AnnealedLangevinActor
 from torchrl_aca.schedule import VarianceExplodingSchedule
@@ -41,6 +41,14 @@ def test_the_noise_of_the_levels_grows_geometrically():
 def test_noise_that_does_not_grow_is_refused(sigmas):
     with pytest.raises(ValueError, match="0 < sigma_min < sigma_max"):
         VarianceExplodingSchedule(3, *sigmas)
+
+
+def test_each_chain_takes_the_noise_that_it_is_made_for():
+    critic = NoiseLevelCritic(OBS, ACTION, num_steps=T)
+    with pytest.raises(ValueError, match="expected a NoiseSchedule, got a VarianceExploding"):
+        CriticGuidedDenoisingActor(critic, VarianceExplodingSchedule(T))
+    with pytest.raises(ValueError, match="expected a VarianceExplodingSchedule, got a NoiseSched"):
+        AnnealedLangevinActor(critic, NoiseSchedule.cosine(T))
 
 
 @pytest.mark.parametrize("unit", [True, False])

@@ -225,7 +225,7 @@ def test_the_quickstart_makes_its_data_and_is_short():
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["dataset=null"], "dataset=null: expected the directory.*make_dataset.py"),
+        (["dataset=null"], "dataset=null: expected the directory.*or learn without"),
         (["dataset=d4rl:halfcheetah-medium-v2"], "import_dataset.py first.*wrong rows"),
         (["env=walker2d"], "is of Hopper-v4; expected data of Walker2d-v4"),
         (["offline_fraction=1.5"], "offline_fraction=1.5: expected less than or equal to 1"),

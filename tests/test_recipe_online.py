@@ -175,6 +175,13 @@ def test_a_resume_that_changes_the_run_is_refused(unbroken, overrides, message):
         resumed_config(cfg, overrides)
 
 
+def test_an_offline_phase_without_data_is_refused(tmp_path):
+    cfg = composed("algo=cql", "optim.offline_updates=5", f"run_dir={tmp_path / 'here'}")
+    with pytest.raises(RunError, match="optim.offline_updates=5: expected 0.*o2o_halfcheetah.py"):
+        train(cfg)
+    assert not (tmp_path / "here").exists()
+
+
 @pytest.mark.parametrize(
     ("total", "message"),
     [

@@ -327,6 +327,20 @@ def test_what_does_not_fit_is_refused_with_a_reason(
     assert not (tmp_path / "here").exists()
 
 
+def test_an_offline_phase_needs_data(tmp_path):
+    typed = [s for s in settings(tmp_path, tmp_path / "here", "wsrl") if "dataset" not in s]
+    with pytest.raises(RunError, match="dataset=null.*algo=wsrl has an offline phase"):
+        run_o2o(*typed)
+    assert not (tmp_path / "here").exists()
+
+
+def test_an_endless_reward_that_is_not_discounted_is_told(data, tmp_path):
+    typed = ["calql.tail=bootstrap_rate", "optim.gamma=1"]
+    with pytest.raises(RunError, match="calql and optim.gamma: .* needs gamma below 1, got"):
+        run_o2o(*settings(data, tmp_path / "here", "calql"), *typed)
+    assert not (tmp_path / "here").exists()
+
+
 def test_another_environment_is_refused_where_no_data_tell(trained, tmp_path):
     typed = [s for s in settings(tmp_path, tmp_path / "here", "wsrl") if "dataset" not in s]
     with pytest.raises(RunError, match="has env.name=Hopper-v4; expected Walker2d-v4"):

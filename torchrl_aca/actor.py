@@ -86,9 +86,10 @@ class CriticGuidedDenoisingActor(ChainPolicy):
         out_keys: the action's key.
 
     Raises:
-        ValueError: if a number is out of range, the spec is not a bounded vector, or the critic and
-            the schedule differ in ``num_steps``; also for both ``num_inference_steps`` and
-            ``inference_levels``, or levels that do not rise from 1 to ``T``.
+        ValueError: if a number is out of range, the spec is not a bounded vector, the schedule is
+            not of the chain's kind, or the critic and the schedule differ in ``num_steps``; also
+            for both ``num_inference_steps`` and ``inference_levels``, or levels that do not rise
+            from 1 to ``T``.
 
     Examples:
         >>> critic = NoiseLevelCritic(17, 6)
@@ -97,6 +98,7 @@ class CriticGuidedDenoisingActor(ChainPolicy):
         torch.Size([3, 6])
     """
 
+    schedule_kind: type = NoiseSchedule
     guidance_weight: Tensor
     schedule: Any
     chain_schedule: Any
@@ -129,6 +131,11 @@ class CriticGuidedDenoisingActor(ChainPolicy):
         check_at_least(0, guidance_weight=guidance_weight, clip_denoised=clip_denoised)
         check_above(0, langevin_step_size=langevin_step_size)
         check_choice(("denoising", "langevin"), sampler=sampler)
+        if not isinstance(schedule, self.schedule_kind):
+            raise ValueError(
+                f"{type(self).__name__} expected a {self.schedule_kind.__name__}, got a "
+                f"{type(schedule).__name__}. Its chain is made for that noise."
+            )
         self.critic: NoiseLevelCriticBase = as_noise_level_critic(critic)
         if getattr(critic, "num_steps", schedule.num_steps) != schedule.num_steps:
             raise ValueError(

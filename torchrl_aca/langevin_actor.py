@@ -54,6 +54,7 @@ class AnnealedLangevinActor(CriticGuidedDenoisingActor):
         torch.Size([3, 6])
     """
 
+    schedule_kind = VarianceExplodingSchedule
     step_sizes: Tensor
     step_levels: Tensor
 

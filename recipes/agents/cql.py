@@ -13,6 +13,7 @@ from torchrl.envs import EnvBase
 from agents.ensemble import EnsembleSACSettings, initialised, make_critics, policy_builder
 from agents.ensemble_steps import DelayedActor, EnsembleSteps, actor_interval, both
 from torchrl_aca.baselines import CalQLLoss, EnsembleCQLLoss
+from torchrl_aca.errors import RunError
 from torchrl_aca.offline import return_bounds
 from torchrl_aca.offline.bounds import Tail
 from torchrl_aca.replay import FinishedEpisodes
@@ -72,7 +73,10 @@ def make_calql(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
     update = both(conservative_step(steps, cfg), steps.actor_step())
 
     def with_bounds(rows: TensorDictBase) -> TensorDictBase:
-        bounds = return_bounds(rows, cfg.optim.gamma, **cfg.calql.model_dump())
+        try:
+            bounds = return_bounds(rows, cfg.optim.gamma, **cfg.calql.model_dump())
+        except ValueError as error:
+            raise RunError(f"calql and optim.gamma: {error}") from error
         return rows.copy().set("mc_return", bounds)
 
     finished = FinishedEpisodes(with_bounds)

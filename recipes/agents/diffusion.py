@@ -17,11 +17,17 @@ from torchrl_aca.baselines import DiffusionPolicyLoss, make_diffusion_policy
 from torchrl_aca.training.acceleration import Step, capture, compiled, descend, make_adam
 from torchrl_aca.training.agent import Stateful
 from torchrl_aca.training.checkpoint import Counters
-from torchrl_aca.training.config import Count, NonNegative, Positive, Section, Widths
+from torchrl_aca.training.config import (
+    Activation,
+    Count,
+    NonNegative,
+    Positive,
+    Section,
+    Widths,
+)
 from torchrl_aca.training.policy import PolicyBuilder
 
 Candidates = Annotated[int, Field(ge=1, le=10**5)]
-Activation = Literal["Mish", "ReLU", "GELU"]
 
 
 class DiffusionSettings(Section):

@@ -1,4 +1,4 @@
-"""Whether this run can go on from the agent that another one has trained on data alone."""
+"""Whether a run may have an offline phase, and whether it can take over that of another run."""
 
 from __future__ import annotations
 
@@ -14,6 +14,15 @@ from torchrl_aca.training.pretrained import read_pretrained, take_over
 
 DATA = f"SHA-256 of its {METADATA_FILE}"  # the row of the card that tells one data set from another
 OF_ONE_PHASE = ("total_updates", "offline_updates", "utd_ratio")  # may differ between the two runs
+
+
+def refuse_offline_phase(cfg: Any) -> None:
+    """Raises `RunError` if updates on data alone are asked of a recipe that has no data."""
+    if cfg.optim.offline_updates:
+        raise RunError(
+            f"optim.offline_updates={cfg.optim.offline_updates}: expected 0, because this recipe "
+            "has no data to learn from. Leave it out, or use recipes/o2o_halfcheetah.py."
+        )
 
 
 def require_offline_phase(cfg: Any, agent: Agent) -> None:

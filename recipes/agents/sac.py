@@ -7,17 +7,16 @@ from typing import Any
 
 import torch
 from pydantic import model_validator
-from tensordict import TensorDictBase
-from torch import nn
+from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded
 from torchrl.envs import EnvBase
 from torchrl.modules import ValueOperator
 from torchrl.objectives import SACLoss, SoftUpdate
 
 from torchrl_aca.baselines import make_gaussian_policy, make_mlp
-from torchrl_aca.training.acceleration import capture, compiled, make_adam
+from torchrl_aca.training.acceleration import capture, compiled, descend, make_adam
 from torchrl_aca.training.agent import Agent
-from torchrl_aca.training.config import Optim, Positive, Section, Widths
+from torchrl_aca.training.config import Activation, Optim, Positive, Section, Widths
 from torchrl_aca.training.policy import PolicyBuilder
 
 
@@ -25,18 +24,16 @@ class SACSettings(Section):
     """The section `sac`."""
 
     num_cells: Widths
-    activation: str
+    activation: Activation
     alpha_init: Positive
     log_std_min: float
     log_std_max: float
+    squash_correction: bool
     target_entropy_scale: float
     reward_scale: Positive
 
     @model_validator(mode="after")
-    def _names(self) -> SACSettings:
-        kind = getattr(nn, self.activation, None)
-        if not (isinstance(kind, type) and issubclass(kind, nn.Module)):
-            self.refuse("activation", "the name of an activation in torch.nn, such as ReLU")
+    def _bounds(self) -> SACSettings:
         if self.log_std_max < self.log_std_min:
             self.refuse("log_std_max", f"at least sac.log_std_min ({self.log_std_min})")
         return self
@@ -50,43 +47,64 @@ class SACOptim(Optim):
 
 def make_sac(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
     """SAC with a tanh-squashed Gaussian, two critics and a learned temperature."""
-    settings = cfg.sac
+    settings, optim = cfg.sac, cfg.optim
     mlp = {"num_cells": settings.num_cells, "activation": settings.activation}
-    bounds = {"log_std_min": settings.log_std_min, "log_std_max": settings.log_std_max}
-    builder = PolicyBuilder.of(env, make_gaussian_policy, **mlp, **bounds)
+    density = {
+        "log_std_min": settings.log_std_min,
+        "log_std_max": settings.log_std_max,
+        "squash_correction": settings.squash_correction,
+    }
+    builder = PolicyBuilder.of(env, make_gaussian_policy, **mlp, **density)
     policy, action_dim = builder.build(device), builder.spec.shape[-1]
-    critic = ValueOperator(
-        make_mlp(builder.observation_dim + action_dim, 1, **mlp, device=device),
-        in_keys=["observation", "action"],
-    )
+    num_in = builder.observation_dim + action_dim
+    critics = [
+        ValueOperator(make_mlp(num_in, 1, **mlp, device=device), in_keys=["observation", "action"])
+        for _ in range(2)
+    ]
+    target_entropy = -settings.target_entropy_scale * action_dim
+    if settings.squash_correction:  # the density is of actions in env units; the target is not
+        target_entropy += log_half_range(builder.spec)
     loss = SACLoss(
         policy,
-        critic,
-        num_qvalue_nets=2,
+        critics,
         loss_function="l2",
         alpha_init=settings.alpha_init,
-        # The policy's density is of actions in env units; the target is meant for [-1, 1].
-        target_entropy=-settings.target_entropy_scale * action_dim + log_half_range(builder.spec),
+        target_entropy=target_entropy,
     ).to(device)
-    loss.make_value_estimator(gamma=cfg.optim.gamma)
-    target_update = SoftUpdate(loss, tau=cfg.optim.tau)
-    optimizer = make_adam(loss.parameters(), cfg.optim.lr, cfg.cudagraphs)
-    evaluate_loss = compiled(loss, cfg.compile)
+    loss.make_value_estimator(gamma=optim.gamma)
+    target_update = SoftUpdate(loss, tau=optim.tau)
+    policy_params = [*loss.actor_network_params.parameters(), loss.log_alpha]
+    optimizer = make_adam(loss.qvalue_network_params.parameters(), optim.lr, cfg.cudagraphs)
+    actor_optimizer = make_adam(policy_params, optim.lr, cfg.cudagraphs)
+
+    @partial(compiled, enabled=cfg.compile)
+    def qvalue_loss(batch: TensorDictBase) -> TensorDict:
+        return TensorDict(loss_qvalue=loss.qvalue_v2_loss(batch)[0])
+
+    @partial(compiled, enabled=cfg.compile)
+    def policy_loss(batch: TensorDictBase) -> TensorDict:
+        loss_actor, metadata = loss.actor_loss(batch)
+        log_prob = metadata["log_prob"]
+        loss_alpha = loss.alpha_loss(log_prob).mean()
+        alpha = loss.log_alpha.detach().exp()
+        return TensorDict(
+            loss_policy=loss_actor + loss_alpha,  # one of the actor, one of log alpha
+            loss_actor=loss_actor,
+            loss_alpha=loss_alpha,
+            alpha=alpha,
+            entropy=-log_prob.mean(),
+        )
 
     @partial(capture, enabled=cfg.cudagraphs)
     def update(batch: TensorDictBase) -> TensorDictBase:
         batch = batch.copy()
         batch["next", "reward"] = settings.reward_scale * batch["next", "reward"]
-        losses = evaluate_loss(batch)
-        # The actor's loss sees the critics' values but not their parameters, so one backward pass
-        # through the sum gives each part its own gradient.
-        (losses["loss_actor"] + losses["loss_qvalue"] + losses["loss_alpha"]).backward()
-        optimizer.step()
-        optimizer.zero_grad()
+        metrics = descend(qvalue_loss(batch), "loss_qvalue", optimizer)
         target_update.step()
-        return losses.detach()
+        metrics.update(descend(policy_loss(batch), "loss_policy", actor_optimizer))
+        return metrics.exclude("loss_policy")
 
-    state = {"loss": loss, "optimizer": optimizer}
+    state = {"loss": loss, "optimizer": optimizer, "actor_optimizer": actor_optimizer}
     return Agent(policy, update, state, policy_builder=builder)
 
 

@@ -31,9 +31,11 @@ def dataset_path(cfg: Any) -> Path:
         RunError: If none is named, or one that only TorchRL's own readers know.
     """
     if cfg.dataset is None:
+        use = f"algo={cfg.algo.name} has an offline phase, which learns from it"
+        without = "or learn without: offline_fraction=0"
         raise RunError(
             "dataset=null: expected the directory of a data set, or aca:NAME. Make one with "
-            "recipes/make_dataset.py, or learn without: offline_fraction=0."
+            f"recipes/make_dataset.py; {use if makes_offline_phase(cfg) else without}."
         )
     prefix, colon, name = cfg.dataset.partition(":")
     if not colon or Path(cfg.dataset).is_dir():
@@ -50,7 +52,12 @@ def dataset_path(cfg: Any) -> Path:
 
 def needs_data(cfg: Any) -> bool:
     """Whether there are minibatches with rows of the data set, in the online phase or before."""
-    return bool(cfg.offline_fraction or (cfg.optim.offline_updates and cfg.pretrained is None))
+    return bool(cfg.offline_fraction or makes_offline_phase(cfg))
+
+
+def makes_offline_phase(cfg: Any) -> bool:
+    """Whether there are updates on the data alone, which no other run has made."""
+    return bool(cfg.optim.offline_updates and cfg.pretrained is None)
 
 
 def generate_missing(cfg: Any) -> None:

@@ -47,7 +47,7 @@ class DiffusionPolicyLoss(TDLoss):
             the action). Default: True.
 
     Attributes:
-        needs_schedule: whether the loss noises actions, for which the policy needs a schedule.
+        needs_schedule: whether the policy has to have a denoising chain, and so a schedule.
 
     Raises:
         ValueError: if the policy has no critics, or not the chain that the loss needs, or a number
@@ -111,8 +111,8 @@ class DiffusionPolicyLoss(TDLoss):
             raise ValueError("The policy must have critics: build it with critic=... .")
         if self.needs_schedule and actor_network.schedule is None:
             raise ValueError(
-                f"{type(self).__name__} noises actions: build the policy with a NoiseSchedule, not "
-                "with step sizes."
+                f"{type(self).__name__} is for denoising chains: build the policy with a "
+                "NoiseSchedule, not with step sizes."
             )
         if num_target_candidates is None:
             num_target_candidates = actor_network.num_candidates

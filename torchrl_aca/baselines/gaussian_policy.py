@@ -11,6 +11,8 @@ from torch import Tensor, nn
 from torchrl.data import Bounded
 from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, TanhNormal
 
+from torchrl_aca.stacked import truncated_normal_
+
 __all__ = ["make_clipped_gaussian_policy", "make_gaussian_policy", "make_mlp"]
 
 
@@ -26,6 +28,28 @@ class BoundedNormalParams(nn.Module):
         """Returns mean and standard deviation, (..., A) each."""
         mean, log_std = params.chunk(2, dim=-1)
         return mean, log_std.clamp(*self.bounds).exp()
+
+
+class UncorrectedTanhNormal(TanhNormal):
+    """A squashed Gaussian that scores an action by the density of what was squashed.
+
+    This is no density of the action: the correction for the tanh is missing, as in the code base
+    that ACA's paper compares in.
+    """
+
+    def rsample_and_log_prob(self, sample_shape: Sequence[int] = ()) -> tuple[Tensor, Tensor]:
+        """Returns actions with a gradient, and their scores."""
+        value = self.base_dist.rsample(torch.Size(sample_shape))
+        return self.transforms[0](value), self.base_dist.log_prob(value)
+
+    def sample_and_log_prob(self, sample_shape: Sequence[int] = ()) -> tuple[Tensor, Tensor]:
+        """Returns actions without a gradient, and their scores."""
+        value = self.base_dist.sample(torch.Size(sample_shape))
+        return self.transforms[0](value), self.base_dist.log_prob(value)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Returns the scores of any actions."""
+        return self.base_dist.log_prob(self.transforms[0].inv(value))
 
 
 class FreeStd(nn.Module):
@@ -58,7 +82,7 @@ def make_mlp(
     layer_norm: bool = False,
     device: torch.device | str | None = None,
 ) -> MLP:
-    """Builds TorchRL's MLP, with torch's own initialisation.
+    """Builds TorchRL's MLP with the first weights of ACA's critic: truncated normal, no biases.
 
     Args:
         num_in: size of the input.
@@ -75,7 +99,12 @@ def make_mlp(
         kwargs = [{"normalized_shape": cells, "eps": 1e-6} for cells in num_cells]
         norm = {"norm_class": nn.LayerNorm, "norm_kwargs": kwargs}
     kind = getattr(nn, activation)
-    return MLP(num_in, num_out, num_cells=num_cells, activation_class=kind, device=device, **norm)
+    mlp = MLP(num_in, num_out, num_cells=num_cells, activation_class=kind, device=device, **norm)
+    for layer in mlp:
+        if isinstance(layer, nn.Linear):
+            truncated_normal_(layer.weight, layer.in_features)
+            nn.init.zeros_(layer.bias)
+    return mlp
 
 
 def make_gaussian_policy(
@@ -84,6 +113,7 @@ def make_gaussian_policy(
     *,
     log_std_min: float = -20.0,
     log_std_max: float = 2.0,
+    squash_correction: bool = True,
     device: torch.device | str | None = None,
     **mlp: Any,
 ) -> ProbabilisticActor:
@@ -96,6 +126,8 @@ def make_gaussian_policy(
     Keyword Args:
         log_std_min: lower bound of the logarithm of the standard deviation. Default: -20.
         log_std_max: upper bound. Default: 2.
+        squash_correction: the log-probability is of the action. False: of what was squashed, as in
+            the code base of the comparison in ACA's paper. Default: True.
         device: device of the parameters.
         mlp: keywords of :func:`make_mlp`.
 
@@ -115,7 +147,7 @@ def make_gaussian_policy(
         TensorDictModule(network, in_keys=["observation"], out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
         spec=spec,
-        distribution_class=TanhNormal,
+        distribution_class=TanhNormal if squash_correction else UncorrectedTanhNormal,
         distribution_kwargs={"low": spec.space.low, "high": spec.space.high},
     )
 

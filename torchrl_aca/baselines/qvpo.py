@@ -77,7 +77,8 @@ class QVPOLoss(DiffusionPolicyLoss):
         kwargs: as of :class:`DiffusionPolicyLoss`.
 
     What a chain draws is taken from the input where it has it: ``policy_action``, the best
-    candidate in env units, with ``policy_weight``, its weight of shape ``(*batch,)``.
+    candidate in env units, with ``policy_weight``, its weight of shape ``(*batch,)``. Levels and
+    noise of the regression are drawn always: there are ``1 + M`` of them for each state.
 
     Raises:
         ValueError: on an unknown option, a number out of range, or a policy of one candidate, whose

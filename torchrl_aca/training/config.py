@@ -20,6 +20,7 @@ NonNegative = Annotated[float, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Device = Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
 Threads = Annotated[int, Field(ge=1, le=4096)] | None
+Activation = Literal["Mish", "ReLU", "GELU"]
 Widths = Annotated[list[Annotated[int, Field(ge=1, le=10**5)]], Field(min_length=1)]
 
 
