@@ -1,21 +1,27 @@
 """The paper's ablations: the return by guidance weight and by number of noise levels.
 
     python results/ablations.py
+    python results/ablations.py runs/studies/guidance_weight
 
 Writes guidance_weight/ablation.png and num_steps/ablation.png from the CSV of the two studies
 (`study=guidance_weight`, `study=num_steps`), with a panel for each task and a point for each seed
-at the last evaluation that all runs of the task have. The paper's setting is marked.
+at the last evaluation that all runs of the task have. The paper's setting is marked. From
+guidance_weight/weights.csv it draws weights.png, the weights that tune themselves; given the runs,
+it writes that table first.
 """
 
 from __future__ import annotations
 
+import csv
+import sys
 from pathlib import Path
 
 from curves import make_panels
-from evaluations import by_setting, names, read_study
+from evaluations import by_setting, names, place_in_study, read_csv, read_evaluations, read_study
 from figures import draw_settings
 
 HERE = Path(__file__).parent
+WEIGHTS = HERE / "guidance_weight/weights.csv"
 # Of each study: the names of its methods, the label of the axis, and the paper's setting.
 ABLATIONS = {
     "guidance_weight": (
@@ -27,18 +33,55 @@ ABLATIONS = {
 }
 
 
+def draw_ablation(study: str, method: str, xlabel: str, default: float) -> None:
+    """Draws the returns of a study by a setting."""
+    rows = read_study(HERE / study / "evaluations.csv")
+    figure, panels = make_panels(names(rows, "task"), xlabel)
+    for task, axes in panels.items():
+        axes.set_xscale("log")
+        axes.axvline(default, color="C3", linewidth=6, alpha=0.2)
+        axes.minorticks_off()
+        draw_settings(axes, by_setting(rows, task, method))
+        axes.xaxis.set_major_formatter("{x:.0f}")
+    figure.savefig(HERE / study / "ablation.png", dpi=120)
+
+
+def write_weights(study: Path) -> None:
+    """Gathers the weights that tuned themselves from the runs of a study."""
+    header = ("task", "method", "seed", "updates", "guidance_weight", "candidate_spread")
+    with open(WEIGHTS, "w", newline="") as file:
+        writer = csv.DictWriter(file, header, extrasaction="ignore")
+        writer.writeheader()
+        for path in sorted(study.glob("*-auto*/metrics.csv")):
+            config, _ = read_evaluations(path.parent)
+            task, method = place_in_study(path.parent, config)
+            run = {"task": task, "method": method, "seed": config.seed}
+            writer.writerows({**run, **row} for row in read_csv(path))
+
+
+def draw_weights() -> None:
+    """Draws them by updates: a line for each run, a colour for each start."""
+    rows = read_csv(WEIGHTS)
+    figure, panels = make_panels(names(rows, "task"), "updates", "guidance weight")
+    for task, axes in panels.items():
+        axes.set_yscale("log")
+        for colour, method in enumerate(names(rows, "method")):
+            own = [row for row in rows if (row["task"], row["method"]) == (task, method)]
+            for number, seed in enumerate(names(own, "seed")):
+                run = [row for row in own if row["seed"] == seed]
+                x, y = ([row[key] for row in run] for key in ("updates", "guidance_weight"))
+                axes.plot(x, y, color=f"C{colour}", label=None if number else method)
+        axes.legend(frameon=False)
+    figure.savefig(WEIGHTS.with_suffix(".png"), dpi=120)
+
+
 def main() -> None:
-    """Draws both figures."""
+    """Draws the figures."""
+    if len(sys.argv) > 1:
+        write_weights(Path(sys.argv[1]))
     for study, (method, xlabel, default) in ABLATIONS.items():
-        rows = read_study(HERE / study / "evaluations.csv")
-        figure, panels = make_panels(names(rows, "task"), xlabel)
-        for task, axes in panels.items():
-            axes.set_xscale("log")
-            axes.axvline(default, color="C3", linewidth=6, alpha=0.2)
-            axes.minorticks_off()
-            draw_settings(axes, by_setting(rows, task, method))
-            axes.xaxis.set_major_formatter("{x:.0f}")
-        figure.savefig(HERE / study / "ablation.png", dpi=120)
+        draw_ablation(study, method, xlabel, default)
+    draw_weights()
 
 
 if __name__ == "__main__":

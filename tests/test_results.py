@@ -146,6 +146,7 @@ def test_cards_are_what_their_command_prints(card, tmp_path):
 
 def test_the_three_sources_of_the_figure_of_short_chains(tmp_path):
     import short_chains
+    from evaluations import by_setting
 
     case = (
         "| HalfCheetah: update, {} target candidates, chain of {} levels | compiled | {} ms |  | |"
@@ -168,6 +169,7 @@ def test_the_three_sources_of_the_figure_of_short_chains(tmp_path):
         {"task": "T", "method": f"levels{levels}_n1", "seed": seed, "updates": u, "return_mean": r}
         for levels, seed, u, r in ((20, 0, 0, 1), (20, 0, 9, 5), (20, 1, 9, 7), (6, 0, 9, 4))
     ]
-    assert short_chains.returns(runs, "T") == {"N = 1": {20: [5.0, 7.0], 6: [4.0]}}
+    found = by_setting(runs, "T", short_chains.METHOD)
+    assert found == {"n1": {20: [5.0, 7.0], 6: [4.0]}}
     with pytest.raises(SystemExit, match="nothing to draw for 'cost'"):
         short_chains.draw(Figure().subplots(), "cost", "ms", {})
