@@ -336,7 +336,7 @@ def test_an_offline_phase_needs_data(tmp_path):
 
 def test_an_endless_reward_that_is_not_discounted_is_told(data, tmp_path):
     typed = ["calql.tail=bootstrap_rate", "optim.gamma=1"]
-    with pytest.raises(RunError, match="calql and optim.gamma: .* needs gamma below 1, got"):
+    with pytest.raises(RunError, match="algo=calql cannot be built: .* needs gamma below 1, got"):
         run_o2o(*settings(data, tmp_path / "here", "calql"), *typed)
     assert not (tmp_path / "here").exists()
 

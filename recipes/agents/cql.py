@@ -13,9 +13,8 @@ from torchrl.envs import EnvBase
 from agents.ensemble import EnsembleSACSettings, initialised, make_critics, policy_builder
 from agents.ensemble_steps import DelayedActor, EnsembleSteps, actor_interval, both
 from torchrl_aca.baselines import CalQLLoss, EnsembleCQLLoss
-from torchrl_aca.errors import RunError
 from torchrl_aca.offline import return_bounds
-from torchrl_aca.offline.bounds import Tail
+from torchrl_aca.offline.bounds import Tail, check_tail
 from torchrl_aca.replay import FinishedEpisodes
 from torchrl_aca.training.acceleration import Step, capture, compiled, descend, make_adam
 from torchrl_aca.training.agent import Agent
@@ -68,15 +67,13 @@ def make_cql(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
 
 def make_calql(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
     """Cal-QL: CQL with a floor from the returns, so online only finished episodes are sampled."""
+    check_tail(cfg.calql.tail, cfg.optim.gamma)
     loss, builder = make_loss(CalQLLoss, cfg, env, device)
     steps = EnsembleSteps(loss, cfg)
     update = both(conservative_step(steps, cfg), steps.actor_step())
 
     def with_bounds(rows: TensorDictBase) -> TensorDictBase:
-        try:
-            bounds = return_bounds(rows, cfg.optim.gamma, **cfg.calql.model_dump())
-        except ValueError as error:
-            raise RunError(f"calql and optim.gamma: {error}") from error
+        bounds = return_bounds(rows, cfg.optim.gamma, **cfg.calql.model_dump())
         return rows.copy().set("mc_return", bounds)
 
     finished = FinishedEpisodes(with_bounds)

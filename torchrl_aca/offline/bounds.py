@@ -14,6 +14,12 @@ from torchrl_aca.offline.dataset import returns_to_go
 Tail = Literal["truncate", "mask", "bootstrap_rate"]
 
 
+def check_tail(tail: Tail, gamma: float) -> None:
+    """Raises `ValueError` if the last reward for ever has no finite sum."""
+    if tail == "bootstrap_rate" and gamma >= 1:
+        raise ValueError(f"tail='bootstrap_rate' needs gamma below 1, got gamma={gamma}.")
+
+
 def return_bounds(
     data: TensorDictBase, gamma: float, *, tail: Tail = "truncate", horizon: int = 460
 ) -> Tensor:
@@ -42,8 +48,7 @@ def return_bounds(
         DatasetError: If no row ends an episode, so that no return is known.
         ValueError: If a setting is out of range.
     """
-    if tail == "bootstrap_rate" and gamma >= 1:
-        raise ValueError(f"tail='bootstrap_rate' needs gamma below 1, got gamma={gamma}.")
+    check_tail(tail, gamma)
     if not data["next", "done"].any():
         raise DatasetError(
             f"none of {len(data)} rows ends an episode (next.done), so returns to go are unknown; "
