@@ -10,7 +10,7 @@ from pydantic import model_validator
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded
 from torchrl.envs import EnvBase
-from torchrl.modules import ValueOperator
+from torchrl.modules import ProbabilisticActor, ValueOperator
 from torchrl.objectives import SACLoss, SoftUpdate
 
 from torchrl_aca.baselines import make_gaussian_policy, make_mlp
@@ -47,16 +47,42 @@ class SACOptim(Optim):
 
 def make_sac(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
     """SAC with a tanh-squashed Gaussian, two critics and a learned temperature."""
-    settings, optim = cfg.sac, cfg.optim
-    mlp = {"num_cells": settings.num_cells, "activation": settings.activation}
-    density = {
-        "log_std_min": settings.log_std_min,
-        "log_std_max": settings.log_std_max,
-        "squash_correction": settings.squash_correction,
-    }
-    builder = PolicyBuilder.of(env, make_gaussian_policy, **mlp, **density)
-    policy, action_dim = builder.build(device), builder.spec.shape[-1]
-    num_in = builder.observation_dim + action_dim
+    builder = PolicyBuilder.of(
+        env,
+        make_gaussian_policy,
+        **network_settings(cfg.sac),
+        log_std_min=cfg.sac.log_std_min,
+        log_std_max=cfg.sac.log_std_max,
+        squash_correction=cfg.sac.squash_correction,
+    )
+    policy, optim = builder.build(device), cfg.optim
+    loss = make_loss(cfg, policy, builder, device)
+    target_update = SoftUpdate(loss, tau=optim.tau)
+    policy_params = [*loss.actor_network_params.parameters(), loss.log_alpha]
+    optimizer = make_adam(loss.qvalue_network_params.parameters(), optim.lr, cfg.cudagraphs)
+    actor_optimizer = make_adam(policy_params, optim.lr, cfg.cudagraphs)
+    critics_loss = compiled(partial(qvalue_loss, loss), cfg.compile)
+    actor_loss = compiled(partial(policy_loss, loss), cfg.compile)
+
+    @partial(capture, enabled=cfg.cudagraphs)
+    def update(batch: TensorDictBase) -> TensorDictBase:
+        batch = batch.copy()
+        batch["next", "reward"] = cfg.sac.reward_scale * batch["next", "reward"]
+        metrics = descend(critics_loss(batch), "loss_qvalue", optimizer)
+        target_update.step()
+        metrics.update(descend(actor_loss(batch), "loss_policy", actor_optimizer))
+        return metrics.exclude("loss_policy")
+
+    state = {"loss": loss, "optimizer": optimizer, "actor_optimizer": actor_optimizer}
+    return Agent(policy, update, state, policy_builder=builder)
+
+
+def make_loss(
+    cfg: Any, policy: ProbabilisticActor, builder: PolicyBuilder, device: torch.device
+) -> SACLoss:
+    """TorchRL's loss on the policy and two critics."""
+    settings, action_dim = cfg.sac, builder.spec.shape[-1]
+    num_in, mlp = builder.observation_dim + action_dim, network_settings(settings)
     critics = [
         ValueOperator(make_mlp(num_in, 1, **mlp, device=device), in_keys=["observation", "action"])
         for _ in range(2)
@@ -71,41 +97,32 @@ def make_sac(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
         alpha_init=settings.alpha_init,
         target_entropy=target_entropy,
     ).to(device)
-    loss.make_value_estimator(gamma=optim.gamma)
-    target_update = SoftUpdate(loss, tau=optim.tau)
-    policy_params = [*loss.actor_network_params.parameters(), loss.log_alpha]
-    optimizer = make_adam(loss.qvalue_network_params.parameters(), optim.lr, cfg.cudagraphs)
-    actor_optimizer = make_adam(policy_params, optim.lr, cfg.cudagraphs)
+    loss.make_value_estimator(gamma=cfg.optim.gamma)
+    return loss
 
-    @partial(compiled, enabled=cfg.compile)
-    def qvalue_loss(batch: TensorDictBase) -> TensorDict:
-        return TensorDict(loss_qvalue=loss.qvalue_v2_loss(batch)[0])
 
-    @partial(compiled, enabled=cfg.compile)
-    def policy_loss(batch: TensorDictBase) -> TensorDict:
-        loss_actor, metadata = loss.actor_loss(batch)
-        log_prob = metadata["log_prob"]
-        loss_alpha = loss.alpha_loss(log_prob).mean()
-        alpha = loss.log_alpha.detach().exp()
-        return TensorDict(
-            loss_policy=loss_actor + loss_alpha,  # one of the actor, one of log alpha
-            loss_actor=loss_actor,
-            loss_alpha=loss_alpha,
-            alpha=alpha,
-            entropy=-log_prob.mean(),
-        )
+def network_settings(settings: SACSettings) -> dict[str, Any]:
+    """What actor and critics have in common: keywords of `make_mlp`."""
+    return {"num_cells": settings.num_cells, "activation": settings.activation}
 
-    @partial(capture, enabled=cfg.cudagraphs)
-    def update(batch: TensorDictBase) -> TensorDictBase:
-        batch = batch.copy()
-        batch["next", "reward"] = settings.reward_scale * batch["next", "reward"]
-        metrics = descend(qvalue_loss(batch), "loss_qvalue", optimizer)
-        target_update.step()
-        metrics.update(descend(policy_loss(batch), "loss_policy", actor_optimizer))
-        return metrics.exclude("loss_policy")
 
-    state = {"loss": loss, "optimizer": optimizer, "actor_optimizer": actor_optimizer}
-    return Agent(policy, update, state, policy_builder=builder)
+def qvalue_loss(loss: SACLoss, batch: TensorDictBase) -> TensorDict:
+    """The critics' part of the loss."""
+    return TensorDict(loss_qvalue=loss.qvalue_v2_loss(batch)[0])
+
+
+def policy_loss(loss: SACLoss, batch: TensorDictBase) -> TensorDict:
+    """The part of actor and temperature; no parameter is in both terms of `loss_policy`."""
+    loss_actor, metadata = loss.actor_loss(batch)
+    log_prob = metadata["log_prob"]
+    loss_alpha = loss.alpha_loss(log_prob).mean()
+    return TensorDict(
+        loss_policy=loss_actor + loss_alpha,
+        loss_actor=loss_actor,
+        loss_alpha=loss_alpha,
+        alpha=loss.log_alpha.detach().exp(),
+        entropy=-log_prob.mean(),
+    )
 
 
 def log_half_range(action_spec: Bounded) -> float:
