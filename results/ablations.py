@@ -16,12 +16,13 @@ import csv
 import sys
 from pathlib import Path
 
+from omegaconf import OmegaConf
+
 from curves import make_panels
-from evaluations import by_setting, names, place_in_study, read_csv, read_evaluations, read_study
+from evaluations import by_setting, names, place_in_study, read_csv, read_study
 from figures import draw_settings
 
 HERE = Path(__file__).parent
-WEIGHTS = HERE / "guidance_weight/weights.csv"
 # Of each study: the names of its methods, the label of the axis, and the paper's setting.
 ABLATIONS = {
     "guidance_weight": (
@@ -48,12 +49,13 @@ def draw_ablation(study: str, method: str, xlabel: str, default: float) -> None:
 
 def write_weights(study: Path) -> None:
     """Gathers the weights that tuned themselves from the runs of a study."""
-    header = ("task", "method", "seed", "updates", "guidance_weight", "candidate_spread")
-    with open(WEIGHTS, "w", newline="") as file:
+    measured = ("updates", "guidance_weight", "candidate_spread", "guidance_gain")
+    header = ("task", "method", "seed", *measured)
+    with open(HERE / "guidance_weight/weights.csv", "w", newline="") as file:
         writer = csv.DictWriter(file, header, extrasaction="ignore")
         writer.writeheader()
         for path in sorted(study.glob("*-auto*/metrics.csv")):
-            config, _ = read_evaluations(path.parent)
+            config = OmegaConf.load(path.with_name("config.yaml"))
             task, method = place_in_study(path.parent, config)
             run = {"task": task, "method": method, "seed": config.seed}
             writer.writerows({**run, **row} for row in read_csv(path))
@@ -61,7 +63,8 @@ def write_weights(study: Path) -> None:
 
 def draw_weights() -> None:
     """Draws them by updates: a line for each run, a colour for each start."""
-    rows = read_csv(WEIGHTS)
+    path = HERE / "guidance_weight/weights.csv"
+    rows = read_csv(path)
     figure, panels = make_panels(names(rows, "task"), "updates", "guidance weight")
     for task, axes in panels.items():
         axes.set_yscale("log")
@@ -72,7 +75,7 @@ def draw_weights() -> None:
                 x, y = ([row[key] for row in run] for key in ("updates", "guidance_weight"))
                 axes.plot(x, y, color=f"C{colour}", label=None if number else method)
         axes.legend(frameon=False)
-    figure.savefig(WEIGHTS.with_suffix(".png"), dpi=120)
+    figure.savefig(path.with_suffix(".png"), dpi=120)
 
 
 def main() -> None:

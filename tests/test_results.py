@@ -144,6 +144,35 @@ def test_cards_are_what_their_command_prints(card, tmp_path):
 # --- what a shorter chain costs -------------------------------------------------------------------
 
 
+def test_the_figures_of_the_ablations(tmp_path, monkeypatch):
+    import ablations
+
+    for study, methods in (("guidance_weight", ("w5", "w50", "auto5")), ("num_steps", ("T5",))):
+        (tmp_path / study).mkdir()
+        lines = [f"{method},Task-v1,0,10,{place}" for place, method in enumerate(methods)]
+        text = "\n".join(["method,task,seed,updates,return_mean", *lines])
+        (tmp_path / study / "evaluations.csv").write_text(text)
+    runs = tmp_path / "runs"
+    runs.mkdir()
+    for seed in (0, 1):
+        run_dir = write_run(runs / f"Task-v1-auto5-s{seed}", {0: 1.0}, seed=seed)
+        metrics = "updates,guidance_weight,candidate_spread,guidance_gain,other\n10,{},0.1,0.2,7\n"
+        (run_dir / "metrics.csv").write_text(metrics.format(20 + seed))
+    study = {"tasks": {"Task-v1": []}, "methods": {"auto5": []}}
+    OmegaConf.save(study, runs / "study.yaml")
+    drawn = {}
+    monkeypatch.setattr(
+        Figure, "savefig", lambda figure, path, **_: drawn.update({path.name: figure.axes[0]})
+    )
+    monkeypatch.setattr(ablations, "HERE", tmp_path)
+    monkeypatch.setattr(sys, "argv", ["ablations.py", str(runs)])
+    ablations.main()
+    rows = (tmp_path / "guidance_weight/weights.csv").read_text().splitlines()
+    assert rows[1:] == ["Task-v1,auto5,0,10.0,20.0,0.1,0.2", "Task-v1,auto5,1,10.0,21.0,0.1,0.2"]
+    assert [line.get_ydata() for line in drawn["weights.png"].lines] == [[20.0], [21.0]]
+    assert "ablation.png" in drawn
+
+
 def test_the_three_sources_of_the_figure_of_short_chains(tmp_path):
     import short_chains
     from evaluations import by_setting
