@@ -24,6 +24,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 # What each module of the core may import from the package.
 ALLOWED = {
+    "activations": set(),
     "functional": set(),
     "checks": set(),
     "errors": set(),
@@ -31,7 +32,7 @@ ALLOWED = {
     "schedule": {"checks", "functional"},
     "chain": {"checks", "functional", "schedule"},
     "chain_policy": {"checks", "chain"},
-    "critic": {"checks", "functional", "stacked"},
+    "critic": {"activations", "checks", "functional", "stacked"},
     "custom_critic": {"functional", "critic"},
     "actor": {
         "checks",
@@ -63,6 +64,7 @@ ALLOWED = {
 # What each room may import besides itself.
 ROOMS = {
     "baselines": {
+        "activations",
         "checks",
         "functional",
         "stacked",

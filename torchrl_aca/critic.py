@@ -12,6 +12,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from torchrl_aca import functional as F
+from torchrl_aca.activations import activate, activation_and_slope
 from torchrl_aca.stacked import StackedLinear
 
 __all__ = ["NoiseLevelCritic", "NoiseLevelCriticBase"]
@@ -224,9 +225,9 @@ class NoiseLevelCritic(NoiseLevelCriticBase):
         return observations[0] if len(observations) == 1 else torch.cat(tuple(observations), -1)
 
     def _evaluate(self, features: Any, action: Tensor, index: Tensor) -> Tensor:
-        x = F.activate(self.activation, self._first_layer(features, action, index))
+        x = activate(self.activation, self._first_layer(features, action, index))
         for layer in self._others:
-            x = F.activate(self.activation, layer(x))
+            x = activate(self.activation, layer(x))
         return (
             self.value(x).squeeze(-1).movedim(0, -1).reshape(*action.shape[:-1], self.num_critics)
         )
@@ -239,10 +240,10 @@ class NoiseLevelCritic(NoiseLevelCriticBase):
         """
         with torch.no_grad():
             x = self._first_layer(features, action, index)
-            x, slope = F.activation_and_slope(self.activation, x)
+            x, slope = activation_and_slope(self.activation, x)
             slopes = [slope]
             for layer in self._others:
-                x, slope = F.activation_and_slope(self.activation, layer(x))
+                x, slope = activation_and_slope(self.activation, layer(x))
                 slopes.append(slope)
             gradient = self.value.weight.mT
             for layer, slope in zip(reversed(self._others), reversed(slopes[1:]), strict=True):

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torchrl_aca import functional as F
+from torchrl_aca.activations import activate
 from torchrl_aca.stacked import StackedLinear
 
 __all__ = ["EnsembleMLP"]
@@ -80,7 +80,7 @@ class EnsembleMLP(nn.Module):
         weight = self.weights[0]
         rows = x.reshape(-1, x.shape[-1]).expand(weight.shape[0], -1, -1)
         for layer in self.layers:
-            rows = F.activate(layer, rows) if isinstance(layer, nn.ReLU) else layer(rows)
+            rows = activate(layer, rows) if isinstance(layer, nn.ReLU) else layer(rows)
         return rows.squeeze(-1).mT.reshape(*x.shape[:-1], weight.shape[0])
 
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_aca import functional as F
+from torchrl_aca.activations import activate
 from torchrl_aca.checks import check_choice
 from torchrl_aca.stacked import StackedLinear, truncated_normal_
 
@@ -129,7 +130,7 @@ class NoiseNetwork(nn.Module):
         _, action_weight, _ = self._first.weight.split(self._first_sizes, dim=1)
         x = action @ action_weight.T + share
         for layer in self._others:
-            x = layer(F.activate(self.activation, x))
+            x = layer(activate(self.activation, x))
         return x
 
     def _level_features(self, like: Tensor) -> Tensor:
@@ -224,7 +225,7 @@ class TwinCritic(nn.Module):
         product = product.reshape(self.num_critics, num_candidates, *features.shape[1:])
         x = (product + features.unsqueeze(1)).flatten(1, 2)
         for layer in self._others:
-            x = layer(F.activate(self.activation, x))
+            x = layer(activate(self.activation, x))
         outputs = () if self.num_outputs == 1 else (self.num_outputs,)
         return x.movedim(0, 1).reshape(*action.shape[:-1], self.num_critics, *outputs)
 
