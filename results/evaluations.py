@@ -76,6 +76,14 @@ def read_study(source: Path) -> list[Row]:
     return rows
 
 
+def read_studies(sources: Sequence[Path]) -> list[Row]:
+    """Every evaluation of several sources: of a run that many have, those of the last one."""
+    runs: dict[Any, list[Row]] = {}
+    for source in sources:
+        runs |= by_run(read_study(source))
+    return [row for run in runs.values() for row in run]
+
+
 def read_run(run_dir: Path) -> list[Row]:
     """The evaluations of a run, with what it is and what it took."""
     config, rows = read_evaluations(run_dir)
@@ -132,6 +140,14 @@ def place_in_study(run_dir: Path, config: Any) -> tuple[str, str]:
 def names(rows: Sequence[Row], key: str) -> list[str]:
     """The tasks or methods, in their first order."""
     return list(dict.fromkeys(row[key] for row in rows))
+
+
+def by_run(rows: Sequence[Row]) -> dict[Any, list[Row]]:
+    """The rows of each run, by its task, method and seed."""
+    runs: dict[Any, list[Row]] = {}
+    for row in rows:
+        runs.setdefault((row["task"], row["method"], row["seed"]), []).append(row)
+    return runs
 
 
 def viewed(rows: Sequence[Row], x: str, value: str) -> list[Row]:

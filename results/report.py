@@ -1,13 +1,15 @@
-"""Numbers and figures of a study, from the directories of its runs or from its CSV.
+"""Numbers and figures of a study, from the directories of its runs, its CSV, or several of these.
 
     python results/report.py runs/studies/table2 results/table2
     python results/report.py results/table2/evaluations.csv results/table2 --at 50000 100000
+    python results/report.py results/table2/evaluations.csv runs/studies/table2 results/table2
     python results/report.py runs/studies/offline_to_online OUT --x frames --value normalized_score
 
 Writes one tidy CSV with every evaluation, a card with the tables, and a figure for each question:
 how fast (curves.png), how good over all tasks (aggregate.png), how many runs are how good
 (profiles.png), is one method better than another (improvement.png). What stands below "## Notes" in
-an old card is kept. Needs SciPy and the `recipes` extra.
+an old card is kept. A run that several sources have counts once, as the last of them has it: so new
+runs join a table whose own are gone. Needs SciPy and the `recipes` extra.
 
 Scores are values on a scale of each task: 0 is the mean before training, 1 the best mean of a
 method in this study. Methods are compared at the same updates or frames: on each task the last at
@@ -21,7 +23,6 @@ import csv
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -30,11 +31,12 @@ from evaluations import (
     COLUMNS,
     Row,
     Scores,
+    by_run,
     by_seed,
     last_shared,
     names,
     read_csv,
-    read_study,
+    read_studies,
     scores,
     values_at,
     viewed,
@@ -111,11 +113,8 @@ def paper(task: str, updates: float) -> dict[str, str]:
 
 def runs_table(rows: Sequence[Row]) -> str:
     """A row for each run: how far it came, what it took, and the version that made it."""
-    runs: dict[Any, list[Row]] = {}
-    for row in rows:
-        runs.setdefault((row["task"], row["method"], row["seed"]), []).append(row)
     lines = []
-    for own in runs.values():
+    for own in by_run(rows).values():
         first, row = own[0], own[-1]
         offline = max(0, -first["updates"])
         updates = f"{offline:,.0f} + {row['updates']:,.0f}" if offline else f"{row['updates']:,.0f}"
@@ -237,7 +236,9 @@ def aggregates(rows: Sequence[Row], tasks: Sequence[str], found: Scores, out: Pa
 def main() -> None:
     """Parses the command line, writes the report and prints the card."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("study", type=Path, help="a folder of runs, or an evaluations.csv")
+    parser.add_argument(
+        "study", type=Path, nargs="+", help="a folder of runs, or an evaluations.csv"
+    )
     parser.add_argument("out", type=Path, help="the folder of the report")
     parser.add_argument("--x", choices=("updates", "frames"), default="updates")
     parser.add_argument(
@@ -246,7 +247,7 @@ def main() -> None:
     parser.add_argument("--at", type=float, nargs="+", default=[], help="where to compare")
     parser.add_argument("--line", action="append", default=[], help="TASK:NAME=VALUE, drawn dashed")
     arguments = parser.parse_args()
-    print(write_report(read_study(arguments.study), arguments.out, arguments))
+    print(write_report(read_studies(arguments.study), arguments.out, arguments))
 
 
 if __name__ == "__main__":

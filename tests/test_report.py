@@ -115,6 +115,26 @@ def test_a_report_has_the_paper_beside_and_its_csv_makes_it_again(study, tmp_pat
     assert len(first.splitlines()) == 1 + 2 * 2 + 2 * 3
 
 
+def test_runs_join_a_table_whose_own_are_gone(study, tmp_path):
+    evaluations_csv = tmp_path / "out" / "evaluations.csv"
+    call = [sys.executable, str(SCRIPT), str(study), str(evaluations_csv.parent)]
+    subprocess.run(call, capture_output=True, check=True)
+    new = tmp_path / "new"
+    write_run(new, "aca", 1, {0: 10, 100000: 4000})  # instead of the old one
+    write_run(new, "aca", 2, {0: 10, 100000: 3000})
+    OmegaConf.save(OmegaConf.load(study / "study.yaml"), new / "study.yaml")
+    rows = evaluations.read_studies([evaluations_csv, new])
+    last = {key: run[-1]["return_mean"] for key, run in evaluations.by_run(rows).items()}
+    old = evaluations.by_run(evaluations.read_study(study))
+    assert last == {key: run[-1]["return_mean"] for key, run in old.items()} | {
+        ("Hopper-v4", "aca", 1): 4000,
+        ("Hopper-v4", "aca", 2): 3000,
+    }
+    call = [sys.executable, str(SCRIPT), str(evaluations_csv), str(new), str(tmp_path / "both")]
+    printed = subprocess.run(call, capture_output=True, text=True, check=True).stdout
+    assert "| Hopper-v4, 100,000 updates | 3000 [2000, 4000] (n=3) |" in printed
+
+
 def rows_of(study: Path) -> list[dict]:
     return evaluations.viewed(evaluations.read_study(study), "updates", "return_mean")
 
