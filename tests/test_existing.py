@@ -29,6 +29,11 @@ def test_the_same_command_goes_on_after_a_kill_and_then_has_nothing_to_do(tmp_pa
 
     code, output, errors = run(*HERE, cwd=tmp_path)
     assert (code, errors, output) == (0, "", "here is finished: nothing to do\n")
+    config = tmp_path / "here" / "config.yaml"
+    settings = config.read_bytes()
+    config.write_text("")  # lost: the checkpoint has them too
+    assert run(*HERE, cwd=tmp_path)[1] == output
+    config.write_bytes(settings)
     for path in (tmp_path / "here" / "checkpoints").iterdir():
         path.unlink()  # room on the disk: a finished run is not begun anew for that
     assert run(*HERE, cwd=tmp_path)[1] == output

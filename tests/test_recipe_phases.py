@@ -310,6 +310,7 @@ def test_wsrl_needs_no_data_when_it_is_pretrained(trained, tmp_path):
         ("calql", [], "has algo=calql; expected cql"),
         ("cql", ["env=walker2d"], "is of Hopper-v4; expected data of Walker2d-v4"),
         ("cql", ["cql.num_cells=[8,8]"], r"has cql.num_cells=\[16, 16\]; expected \[8, 8\]"),
+        ("cql", ["env.kwargs={reset_noise_scale: 0.1}"], "has env.kwargs=None; expected {'reset"),
         ("cql", ["cql.weight=1"], "has cql.weight=5.0; expected 1.0"),
         ("cql", ["optim.lr=1e-3"], "has optim.lr=0.0003; expected 0.001"),
         ("cql", ["optim.batch_size=8"], "has optim.batch_size=16; expected 8"),

@@ -229,6 +229,24 @@ def test_many_stops_are_as_good_as_one(unbroken, tmp_path):
     assert_same_state(run_dir, tmp_path / "run")
 
 
+def test_a_run_ended_at_once_tells_how_to_go_on(unbroken, tmp_path, monkeypatch, capsys):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    run_dir, warmup, _ = unbroken
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(os, "kill", interrupt)  # the second Ctrl-C, instead of the first
+        train(tmp_path / "run", warmup=warmup, stop=("online", 20))
+    told = "stopped at once after 49 updates; go on from the newest checkpoint with: python toy.py"
+    assert f"{told} resume={tmp_path / 'run'}\n" in capsys.readouterr().out
+    later = tmp_path / "run" / "checkpoints" / "policy_0000000099.pt"
+    later.write_bytes(b"of a branch whose checkpoints are gone")
+    train(tmp_path / "run", warmup=warmup, resume=True)
+    assert not later.exists()
+    assert_same_state(run_dir, tmp_path / "run")
+    assert without_time(run_dir / "eval.csv") == without_time(tmp_path / "run" / "eval.csv")
+
+
 def test_an_offline_phase_needs_an_agent_that_has_one(tmp_path, monkeypatch):
     agent = toy_agent()
     agent.offline_update = None

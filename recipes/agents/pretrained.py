@@ -66,7 +66,8 @@ def _compared(
     other = stored["algo"]["name"]
     if other not in AGENTS[name].starts_from:
         yield "algo", other, name
-    yield "env.name", stored["env"]["name"], cfg.env.name
+    for key, expected in cfg.env.model_dump().items():
+        yield f"env.{key}", stored["env"].get(key), expected
     for section in AGENTS[name].sections.keys() & AGENTS[other].sections.keys():
         for key, expected in getattr(cfg, section).model_dump().items():
             if not (section == "optim" and key in OF_ONE_PHASE):

@@ -52,7 +52,7 @@ def launch(train: Train, cfg: DictConfig) -> None:
             raise
         raise SystemExit(f"error: {error}") from None
     except KeyboardInterrupt:
-        print("stopped before the run began: nothing is lost", file=sys.stderr)
+        print("stopped at once", file=sys.stderr)  # a run has told how to go on
         raise SystemExit(130) from None
     if not (run_dir / DONE).exists():
         raise SystemExit(STOPPED)
@@ -65,12 +65,14 @@ def start(train: Train, cfg: DictConfig, overrides: Iterable[str]) -> Path:
     if cfg.existing != "resume" or cfg.run_dir is None:
         return train(cfg, None)
     run_dir = Path(cfg.run_dir)
-    done, stored = (run_dir / DONE).exists(), read_config(run_dir)
-    if done and stored is not None and is_finished(run_dir, continued_config(cfg, stored)):
-        print(f"{run_dir} is finished: nothing to do", flush=True)
-        return run_dir
+    done = (run_dir / DONE).exists()
     if not done and not list_checkpoints(run_dir / "checkpoints"):
         return train(cfg, None)
+    if done:
+        stored = read_config(run_dir) or OmegaConf.create(read_checkpoint(run_dir)["config"])
+        if is_finished(run_dir, continued_config(cfg, stored)):
+            print(f"{run_dir} is finished: nothing to do", flush=True)
+            return run_dir
     checkpoint = read_checkpoint(run_dir)
     return train(continued_config(cfg, OmegaConf.create(checkpoint["config"])), checkpoint)
 

@@ -118,6 +118,13 @@ def save_policy(
     replace_file(path, lambda file: torch.save(content, file))
 
 
+def drop_newer_policies(directory: Path, updates: int) -> None:
+    """Removes the policies in `checkpoints/` after more updates than a run that goes on has."""
+    for kept in _kept(directory):
+        if kept != "best" and kept > updates:
+            policy_path(directory, kept).unlink()
+
+
 def load_policy(
     run_dir: str | Path, checkpoint: Which = None, device: torch.device | str = "cpu"
 ) -> TensorDictModuleBase:
@@ -202,10 +209,10 @@ def _factory(name: str) -> Callable[..., TensorDictModuleBase] | None:
     return getattr(found, function) if function in getattr(found, "__all__", ()) else None
 
 
-def _kept(directory: Path) -> list[int | str]:
+def _kept(directory: Path) -> list[int | Literal["best"]]:
     """The policies in a directory: their updates, oldest first, then the best one."""
     numbered = sorted(directory.glob("policy_[0-9]*.pt"))
-    best: list[int | str] = ["best"] if policy_path(directory, "best").exists() else []
+    best: list[Literal["best"]] = ["best"] if policy_path(directory, "best").exists() else []
     return [*(int(path.stem.rpartition("_")[2]) for path in numbered), *best]
 
 

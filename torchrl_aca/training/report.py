@@ -39,10 +39,18 @@ def versions() -> dict[str, Any]:
 
 
 def _commit() -> str | None:
-    command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    """The commit of this package; None where it is installed, be it inside another repository."""
+    here = Path(__file__)
+    if not _git(here.parent, "ls-files", here.name):
+        return None
+    return _git(here.parent, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")
+
+
+def _git(folder: Path, *arguments: str) -> str | None:
+    """What git prints in a folder, or None."""
+    command = ["git", *arguments]
     try:
-        here = Path(__file__).parent
-        result = subprocess.run(command, cwd=here, capture_output=True, text=True, timeout=10)
+        result = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=10)
     except (OSError, subprocess.TimeoutExpired):
         return None
     return result.stdout.strip() or None

@@ -23,7 +23,12 @@ from torchrl_aca.training.due import has_reached, is_better, passed, updates_due
 from torchrl_aca.training.files import write_text
 from torchrl_aca.training.logging import MetricMeans, RunLogger
 from torchrl_aca.training.parts import check_needs, check_savable, make_parts, restore_parts
-from torchrl_aca.training.policy import best_return, policy_path, save_policy
+from torchrl_aca.training.policy import (
+    best_return,
+    drop_newer_policies,
+    policy_path,
+    save_policy,
+)
 from torchrl_aca.training.pretrained import save_pretrained
 from torchrl_aca.training.progress import Pace, ProgressBar
 from torchrl_aca.training.report import plot_curve, versions, write_card
@@ -115,6 +120,7 @@ class Run:
         (self.dir / DONE).unlink(missing_ok=True)
         if resumed:
             require_newest(self.dir, counters.total)
+            drop_newer_policies(self.dir / "checkpoints", counters.total)
         else:
             made_with = versions() | {"parameters": self.agent.num_parameters}
             write_text(self.dir / "versions.json", json.dumps(made_with, indent=2) + "\n")
@@ -289,6 +295,8 @@ class Run:
                 raise RunError(
                     f"{self.cfg.env.name}: {error} What came before is in {self.save()}."
                 ) from None
+            elif isinstance(error, KeyboardInterrupt):
+                self._tell_stop("at once", "go on from the newest checkpoint")
         finally:
             self._signal.__exit__()
             self.bar.close()
@@ -310,7 +318,10 @@ class Run:
             before, after = (float(row["return_mean"]) for row in (rows[0], rows[-1]))
             self.bar.write(f"mean evaluation return: before {before:.1f}, after {after:.1f}")
         else:
-            self.bar.write(
-                f"stopped by {self._signal.received or 'the loop'} after {self.counters.total} "
-                f"updates; go on with: python {self.script} resume={self.dir}"
-            )
+            self._tell_stop(f"by {self._signal.received or 'the loop'}", "go on")
+
+    def _tell_stop(self, how: str, next_step: str) -> None:
+        self.bar.write(
+            f"stopped {how} after {self.counters.total} updates; {next_step} with: "
+            f"python {self.script} resume={self.dir}"
+        )
