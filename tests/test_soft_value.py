@@ -99,23 +99,3 @@ def test_equal_values_have_that_soft_value_whatever_the_temperature():
 def test_wrong_settings_are_told(settings, message):
     with pytest.raises(ValueError, match=message):
         make_loss(**settings)
-
-
-def test_the_bonus_is_the_entropy_of_a_gaussian_as_wide_as_the_candidates():
-    plain, bonus = double_loss(), double_loss(entropy_bonus=0.5)
-    bonus.load_state_dict(plain.state_dict())
-    data = make_data(6).apply(lambda x: x.double() if x.is_floating_point() else x)
-    data["next_action"] = torch.rand(6, 4, 2, dtype=torch.float64) * 2 - 1
-    before = plain.qvalue_loss(data)["target_value"].item()
-    after = bonus.qvalue_loss(data)["target_value"].item()
-    spread = np.sqrt(data["next_action"].numpy().var(1, ddof=1).mean(-1))
-    going = 1 - data["next", "terminated"].squeeze(-1).double().numpy()
-    entropy = 2 * np.log(spread * np.sqrt(2 * np.pi * np.e))
-    assert after - before == pytest.approx(0.875 * 0.5 * (going * entropy).mean(), rel=1e-8)
-
-
-def test_a_bonus_without_soft_values_of_two_candidates_is_told():
-    with pytest.raises(ValueError, match="needs target_value='soft'"):
-        make_loss(entropy_bonus=0.1)
-    with pytest.raises(ValueError, match="got 'soft' and 1"):
-        make_loss(target_value="soft", num_target_candidates=1, entropy_bonus=0.1)

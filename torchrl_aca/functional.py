@@ -18,7 +18,6 @@ __all__ = [
     "candidate_spread",
     "cosine_betas",
     "entropy_std",
-    "gaussian_entropy",
     "guidance_gain",
     "guidance_step",
     "guided_noise",
@@ -196,11 +195,6 @@ def entropy_std(entropy: Tensor, action_dim: int) -> Tensor:
     ``exp(H / A) / sqrt(2 pi e)``, where :func:`surrogate_entropy` leads the exploration noise too.
     """
     return (entropy / action_dim).exp() / math.sqrt(2 * math.pi * math.e)
-
-
-def gaussian_entropy(std: Tensor, action_dim: int) -> Tensor:
-    """Entropy of ``N(0, std^2 I)`` in nats, ``A (log(2 pi e) / 2 + log std)``."""
-    return action_dim * (0.5 * math.log(2 * math.pi * math.e) + std.log())
 
 
 def candidate_spread(candidates: Tensor) -> Tensor:

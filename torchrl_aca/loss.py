@@ -56,9 +56,6 @@ class ACALoss(OpenLoopAlpha, AutoGuidance, TDLoss):
             ``"soft"`` value of all of them, each with exploration noise of its own:
             ``tau log mean_n exp(min_i Q_bar_i(s', a'_n, 0) / tau)``. Default: ``"best"``.
         temperature: ``tau`` of the soft value, in scaled reward. Default: 0.1.
-        entropy_bonus: weight of the entropy that the soft value is raised by, in scaled reward for
-            a nat: that of a Gaussian as wide as the candidates and their exploration noise.
-            Default: 0, none.
         guidance_weight: ``"fixed"``, or ``"auto"`` for :meth:`step_guidance_weight`, which moves
             the actor's ``w`` from where it is; it needs two target candidates or more. Default:
             ``"fixed"``, the paper.
@@ -163,7 +160,6 @@ class ACALoss(OpenLoopAlpha, AutoGuidance, TDLoss):
         num_target_candidates: int | None = None,
         target_value: Literal["best", "soft"] = "best",
         temperature: float = 0.1,
-        entropy_bonus: float = 0.0,
         guidance_weight: Literal["fixed", "auto"] = "fixed",
         guidance_weight_lr: float = 0.01,
         target_spread: float | Literal["auto"] = "auto",
@@ -191,18 +187,12 @@ class ACALoss(OpenLoopAlpha, AutoGuidance, TDLoss):
         check_at_least(1, num_target_candidates=num_target_candidates)
         check_choice(("best", "soft"), target_value=target_value)
         check_above(0, temperature=temperature)
-        if entropy_bonus and (target_value != "soft" or num_target_candidates < 2):
-            raise ValueError(
-                "entropy_bonus needs target_value='soft' and num_target_candidates of 2 or more, "
-                f"got {target_value!r} and {num_target_candidates}."
-            )
         # The actor is no submodule: its parameters are listed below, and only once.
         self.__dict__["actor_network"] = actor_network
         self.convert_to_functional(critic, "qvalue_network", create_target_params=delay_qvalue)
         self.delay_qvalue = delay_qvalue
         self.num_target_candidates = num_target_candidates
         self.target_value, self.temperature = target_value, temperature
-        self.entropy_bonus = entropy_bonus
         self.noise_level_target = noise_level_target
         self.reward_scale = reward_scale
         self.loss_function = loss_function
@@ -324,11 +314,7 @@ class ACALoss(OpenLoopAlpha, AutoGuidance, TDLoss):
         candidates = actions.reshape(-1, *actions.shape[-2:]).movedim(1, 0)
         level = torch.zeros((), dtype=torch.long, device=actions.device)
         values = self.qvalue_network.evaluate(features, candidates, level)
-        value = F.soft_value(values, self.temperature)
-        if self.entropy_bonus:
-            spread = F.candidate_spread(candidates)
-            value = value + self.entropy_bonus * F.gaussian_entropy(spread, actions.shape[-1])
-        return value
+        return F.soft_value(values, self.temperature)
 
     @torch.no_grad()
     def _clean_value(self, features: Any, observation: list[Tensor], action: Tensor) -> Tensor:

@@ -50,7 +50,6 @@ class ACASettings(Section):
     first_level: Annotated[int, Field(ge=0, le=1)]
     target_value: Literal["best", "soft"]
     temperature: Positive
-    entropy_bonus: float
     guidance_weight: Weight
     guidance_weight_init: Positive
     guidance_weight_lr: Positive
@@ -122,7 +121,6 @@ def loss_settings(cfg: Any) -> dict[str, Any]:
     return {
         "target_value": settings.target_value,
         "temperature": settings.temperature,
-        "entropy_bonus": settings.entropy_bonus,
         "guidance_weight": "auto" if settings.auto_guidance else "fixed",
         "guidance_weight_lr": settings.guidance_weight_lr,
         "noise_level_target": settings.noise_level_target,
