@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
+
+import pytest
 
 from torchrl_aca.training import report
 
 
+@pytest.mark.skipif(shutil.which("git") is None, reason="needs git")
 def test_the_commit_is_this_packages_and_not_that_of_a_repository_around_it(tmp_path, monkeypatch):
     def git(*arguments):
         own = ["-c", "user.name=a", "-c", "user.email=a@b.c"]
