@@ -132,6 +132,22 @@ def test_ctrl_c_leaves_a_checkpoint_that_resumes(unbroken, tmp_path):
     assert int(rows_of(tmp_path / "here" / "eval.csv")[-1]["updates"]) == stopped + 5
 
 
+def test_a_second_ctrl_c_ends_the_run_at_once(tmp_path):
+    process = start(*TINY_SAC, "env=halfcheetah", "eval.episodes=20", "run_dir=here", cwd=tmp_path)
+    lines = iter(process.stdout.readline, "")
+    assert any("run directory: here" in line for line in lines)
+    time.sleep(1)  # into the first evaluation, which takes many
+    process.send_signal(signal.SIGINT)
+    assert any("stopping after this evaluation; Ctrl-C again quits" in line for line in lines)
+    process.send_signal(signal.SIGINT)
+    output, errors = process.communicate(timeout=60)
+    assert (process.returncode, errors) == (130, "")
+    assert (
+        f"stopped at once after 0 updates; go on from the newest checkpoint with: python {SCRIPT}"
+        in output
+    )
+
+
 def test_a_variant_belongs_to_rlpd_and_stays_that_of_the_run(tmp_path):
     with pytest.raises(HydraException, match="variant"):
         composed("algo=sac", "variant=wsrl")

@@ -23,6 +23,7 @@ from torchrl_aca.training.config import RunConfig, checked
 from torchrl_aca.training.envs import make_vector_env
 from torchrl_aca.training.randomness import seed_everything
 from torchrl_aca.training.run import Run
+from torchrl_aca.training.run_dir import lock
 
 OFFLINE, WARMUP, UPDATES = 30, 40, 40
 SETTINGS = {
@@ -245,6 +246,18 @@ def test_a_run_ended_at_once_tells_how_to_go_on(unbroken, tmp_path, monkeypatch,
     assert not later.exists()
     assert_same_state(run_dir, tmp_path / "run")
     assert without_time(run_dir / "eval.csv") == without_time(tmp_path / "run" / "eval.csv")
+
+
+def test_an_error_in_the_first_evaluation_frees_the_run(tmp_path, monkeypatch):
+    def fail(run):
+        raise RuntimeError("no evaluation")
+
+    handler = signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr(Run, "log_evaluation", fail)
+    with pytest.raises(RuntimeError, match="no evaluation"):
+        train(tmp_path / "run")
+    assert signal.getsignal(signal.SIGTERM) is handler
+    lock(tmp_path / "run").release()  # would be refused while the run has it
 
 
 def test_an_offline_phase_needs_an_agent_that_has_one(tmp_path, monkeypatch):

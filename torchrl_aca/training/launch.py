@@ -52,8 +52,7 @@ def launch(train: Train, cfg: DictConfig) -> None:
             raise
         raise SystemExit(f"error: {error}") from None
     except KeyboardInterrupt:
-        print("stopped at once", file=sys.stderr)  # a run has told how to go on
-        raise SystemExit(130) from None
+        raise SystemExit(130) from None  # a run has told how to go on
     if not (run_dir / DONE).exists():
         raise SystemExit(STOPPED)
 

@@ -155,8 +155,12 @@ class Run:
     def __enter__(self) -> Run:
         """Starts to listen for signals; evaluates the policy that a new run begins with."""
         self._signal.__enter__()
-        if not self.logger.tables["eval"].rows:
-            self.log_evaluation()
+        try:
+            if not self.logger.tables["eval"].rows:
+                self.log_evaluation()
+        except BaseException as error:  # Python leaves only what it has entered
+            self.__exit__(type(error), error, error.__traceback__)
+            raise
         return self
 
     # --- the loop ---------------------------------------------------------------------------------
