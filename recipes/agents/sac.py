@@ -28,7 +28,7 @@ class SACSettings(Section):
     alpha_init: Positive
     log_std_min: float
     log_std_max: float
-    squash_correction: bool = True  # runs from before it was a key resume
+    squash_correction: bool
     target_entropy_scale: float
     reward_scale: Positive
 
