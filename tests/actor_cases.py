@@ -1,4 +1,4 @@
-"""The small actor that its tests share."""
+"""The small critic and the small actor that their tests share."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ DETERMINISTIC = set_exploration_type(ExplorationType.DETERMINISTIC)
 
 
 def make_critic(observation_dim=OBS, action_dim=ACTION, **kwargs):
+    """A critic with biases that are not zero."""
     kwargs = {"num_cells": (7, 5), "embedding_dim": 8, "num_steps": T, **kwargs}
     critic = NoiseLevelCritic(observation_dim, action_dim, **kwargs)
     for name, parameter in critic.named_parameters():

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 
 TENSORS = {"dtype": torch.float64}
+assert_close = partial(torch.testing.assert_close, rtol=0, atol=1e-12)
 
 
 def tensor(*values):
     return torch.tensor(values, **TENSORS)
-
-
-def close(actual, expected, atol=1e-12):
-    torch.testing.assert_close(actual, expected, rtol=0, atol=atol)

@@ -8,15 +8,15 @@ import pytest
 import torch
 from torch import nn
 
-from by_hand import TENSORS, close, tensor
+from by_hand import TENSORS, assert_close, tensor
 from torchrl_aca import activations as A
 
 
 def test_mish_and_slope_by_hand():
     # tanh(log 2) = 3/5 at x = 0: mish = 0, slope = 3/5.
     value, slope = A.mish_and_slope(tensor(0.0))
-    close(value, tensor(0.0))
-    close(slope, tensor(0.6))
+    assert_close(value, tensor(0.0))
+    assert_close(slope, tensor(0.6))
 
 
 MISH_DTYPES = [
@@ -49,7 +49,7 @@ def test_slope_of_mish_is_one_up_to_the_largest_number(dtype):
 
 def test_mish_by_hand():
     # e = 2 and n = 8 at x = log 2: mish = 4/5 log 2.
-    close(A.mish(tensor(math.log(2))), tensor(0.8 * math.log(2)))
+    assert_close(A.mish(tensor(math.log(2))), tensor(0.8 * math.log(2)))
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), MISH_DTYPES)
@@ -67,9 +67,9 @@ def test_mish_and_its_gradient_agree_with_pytorchs(dtype, tolerance):
 def test_relu_and_its_gradient_by_hand():
     x = tensor(-2.0, 0.0, 3.0).requires_grad_()
     value = A.relu(x)
-    close(value.detach(), tensor(0.0, 0.0, 3.0))
+    assert_close(value.detach(), tensor(0.0, 0.0, 3.0))
     (slope,) = torch.autograd.grad(value, x, tensor(5.0, 5.0, 5.0))
-    close(slope, tensor(0.0, 0.0, 5.0))  # at 0 as PyTorch's own
+    assert_close(slope, tensor(0.0, 0.0, 5.0))  # at 0 as PyTorch's own
 
 
 @pytest.mark.parametrize("activation", [nn.Mish(), nn.ReLU(), nn.Tanh()])
@@ -92,5 +92,5 @@ def test_activation_and_slope_agree_with_autograd_in_every_grad_mode(activation,
     (expected_slope,) = torch.autograd.grad(expected.sum(), x)
     with mode():
         value, slope = A.activation_and_slope(activation(), x.detach())
-    close(value.detach(), expected.detach())
-    close(slope.detach(), expected_slope)
+    assert_close(value.detach(), expected.detach())
+    assert_close(slope.detach(), expected_slope)

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+from functools import partial
 
 import numpy as np
 import pytest
@@ -9,21 +10,14 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
+import actor_cases
 import oracle
+from actor_cases import ACTION, BATCH, CANDIDATES, OBS
 from torchrl_aca import NoiseLevelCritic, NoiseLevelCriticBase
 from torchrl_aca.interop import to_official
 
-OBS, ACTION, BATCH, CANDIDATES, T = 4, 3, 6, 5, 20
-
-
-def make_critic(**kwargs):
-    """A small critic with biases that are not zero."""
-    kwargs = {"num_cells": (7, 5), "embedding_dim": 8, "num_steps": T, **kwargs}
-    critic = NoiseLevelCritic(OBS, ACTION, **kwargs)
-    for name, parameter in critic.named_parameters():
-        if name.endswith("bias"):
-            nn.init.normal_(parameter, std=0.1)
-    return critic
+T = 20
+make_critic = partial(actor_cases.make_critic, num_steps=T)
 
 
 def num_parameters(critic):

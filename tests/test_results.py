@@ -141,7 +141,7 @@ def test_cards_are_what_their_command_prints(card, tmp_path):
     assert "## Notes" in text
 
 
-# --- what a shorter chain costs -------------------------------------------------------------------
+# --- figures of studies ---------------------------------------------------------------------------
 
 
 def test_the_figures_of_the_ablations(tmp_path, monkeypatch):
@@ -161,16 +161,21 @@ def test_the_figures_of_the_ablations(tmp_path, monkeypatch):
     study = {"tasks": {"Task-v1": []}, "methods": {"auto5": []}}
     OmegaConf.save(study, runs / "study.yaml")
     drawn = {}
-    monkeypatch.setattr(
-        Figure, "savefig", lambda figure, path, **_: drawn.update({path.name: figure.axes[0]})
-    )
+
+    def save(figure, path, **_):
+        drawn[str(path.relative_to(tmp_path))] = figure.axes[0]
+
+    monkeypatch.setattr(Figure, "savefig", save)
     monkeypatch.setattr(ablations, "HERE", tmp_path)
     monkeypatch.setattr(sys, "argv", ["ablations.py", str(runs)])
     ablations.main()
     rows = (tmp_path / "guidance_weight/weights.csv").read_text().splitlines()
     assert rows[1:] == ["Task-v1,auto5,0,10.0,20.0,0.1,0.2", "Task-v1,auto5,1,10.0,21.0,0.1,0.2"]
-    assert [line.get_ydata() for line in drawn["weights.png"].lines] == [[20.0], [21.0]]
-    assert "ablation.png" in drawn
+    weights = drawn.pop("guidance_weight/weights.png")
+    assert [line.get_ydata() for line in weights.lines] == [[20.0], [21.0]]
+    assert set(drawn) == {"guidance_weight/ablation.png", "num_steps/ablation.png"}
+    fixed = [label.get_text() for label in drawn["guidance_weight/ablation.png"].get_legend().texts]
+    assert fixed == ["w", "auto"]
 
 
 def test_the_three_sources_of_the_figure_of_short_chains(tmp_path):
