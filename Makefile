@@ -44,7 +44,7 @@ demo: $(INSTALLED)  ## train ACA on a small MuJoCo task and draw its learning cu
 	@$(WITH_TMPDIR) $(VENV) recipes/online_mujoco.py --config-name quickstart
 
 test: $(INSTALLED)  ## run all tests on up to four cores (ARGS="-m 'not slow'" for the quick ones)
-	@$(WITH_TMPDIR) $(VENV) -m pytest -n auto --maxprocesses 4 $(ARGS)
+	@$(WITH_TMPDIR) $(VENV) -m pytest -n auto --maxprocesses 4 --dist worksteal $(ARGS)
 
 docs: $(INSTALLED)  ## build the documentation into docs/_build/html, warnings are errors
 	@$(WITH_TMPDIR) $(VENV) -m sphinx -q -W --keep-going -b html -d .cache/doctrees $(ARGS) docs docs/_build/html

@@ -70,7 +70,8 @@ BANDIT = {
         "optim.actor_lr=1e-2",
         "dipo.num_cells=[64,64]",
         "dipo.num_steps=20",
-        "dipo.num_gradient_steps=60",
+        "dipo.num_gradient_steps=30",
+        "dipo.action_lr=0.06",
     ],
     "nclql": ["optim.lr=1e-2", "nclql.num_cells=[64,64]", "nclql.num_steps=9"],
     "qsm": [

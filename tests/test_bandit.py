@@ -26,11 +26,9 @@ METHODS = ("aca", "diffusion_q", "langevin_q")
 RIVALS = ("sdac", "qsm", "dacer", "dipo")
 PAPER_SUMS = ("0.993", "0.636", "0.570", "0.927", "0.465", "1.000", "0.401")
 HIGH = np.sqrt(2) * np.array([[0, 1], [1, 0], [0, -1], [-1, 0]])  # top, right, bottom, left
-SMALL = [
-    "critic.num_cells=[64,64,64]",
-    "collector.frames=20000",
-    "collector.warmup_frames=10000",
-    "sweep.weights=[30,40]",
+SHORT = [
+    "collector.frames=12000",
+    "collector.warmup_frames=6000",
     "sweep.num_samples=500",
     "report.num_samples=1000",
 ]
@@ -110,7 +108,7 @@ def test_shares_count_what_lies_within_the_radius_in_the_papers_order():
 
 @pytest.mark.slow
 def test_aca_finds_all_high_modes_with_more_samples_than_the_plain_critic():
-    cfg = composed(*SMALL)
+    cfg = composed(*SHORT, "critic.num_cells=[64,64,64]", "sweep.weights=[30,40]")
     noisy, plain = (bandit_2d.run((cfg, method, 0))[0][0] for method in ("aca", "diffusion_q"))
     assert min(noisy[name] for name in ("top", "right", "bottom", "left")) > 0.15
     assert noisy["sum"] > plain["sum"] + 0.05
@@ -119,7 +117,7 @@ def test_aca_finds_all_high_modes_with_more_samples_than_the_plain_critic():
 @pytest.mark.slow
 def test_dacer_ends_in_one_mode_and_qsm_in_all_four():
     one, four = (
-        bandit_2d.run((composed("methods=all"), name, 0))[0][0] for name in ("dacer", "qsm")
+        bandit_2d.run((composed(*SHORT, "methods=all"), name, 0))[0][0] for name in ("dacer", "qsm")
     )
     assert max(one[name] for name in ("top", "right", "bottom", "left")) > 0.95
     assert min(four[name] for name in ("top", "right", "bottom", "left")) > 0.1
