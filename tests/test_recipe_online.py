@@ -133,7 +133,7 @@ def test_ctrl_c_leaves_a_checkpoint_that_resumes(unbroken, tmp_path):
 
 
 def test_a_second_ctrl_c_ends_the_run_at_once(tmp_path):
-    process = start(*TINY_SAC, "env=halfcheetah", "eval.episodes=80", "run_dir=here", cwd=tmp_path)
+    process = start(*TINY_SAC, "env=halfcheetah", "eval.episodes=20", "run_dir=here", cwd=tmp_path)
     lines = iter(process.stdout.readline, "")
     assert any("run directory: here" in line for line in lines)
     time.sleep(1)  # into the first evaluation, which takes many

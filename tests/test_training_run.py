@@ -128,15 +128,26 @@ def test_metric_means_average_over_the_updates_that_report():
         means.pop()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_first_signal_asks_to_stop_and_handlers_are_put_back(number):
-    before = signal.getsignal(number)
-    with StopSignal() as stop:
-        assert stop.received is None
-        os.kill(os.getpid(), number)
-        assert stop.received == number.name
+@pytest.mark.parametrize("ignored", [False, True])  # ignored: in what a script runs with `&`
+@pytest.mark.parametrize(
+    ("number", "at_once"),
+    [(signal.SIGINT, signal.default_int_handler), (signal.SIGTERM, signal.SIG_DFL)],
+)
+def test_first_signal_asks_to_stop_the_second_stops_and_handlers_are_put_back(
+    number, at_once, ignored
+):
+    found = signal.getsignal(number)
+    before = signal.SIG_IGN if ignored else found
+    signal.signal(number, before)
+    try:
+        with StopSignal() as stop:
+            assert stop.received is None
+            os.kill(os.getpid(), number)
+            assert stop.received == number.name
+            assert signal.getsignal(number) is at_once
         assert signal.getsignal(number) is before
-    assert signal.getsignal(number) is before
+    finally:
+        signal.signal(number, found)
 
 
 def test_an_interval_has_passed_when_a_multiple_lies_between():

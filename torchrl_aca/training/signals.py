@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import subprocess
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import FrameType
 from typing import Any
 
@@ -14,12 +14,18 @@ STOPPED = 143  # exit status of a run that was told to stop; that of a shell for
 class StopSignal:
     """Turns the first Ctrl-C or SIGTERM into a wish to stop; a second one stops at once.
 
+    So it is where they were ignored before, too, as Ctrl-C is in what a script puts into the
+    background.
+
     Attributes:
         received: The signal's name, or None.
         activity: What the run is in the middle of, for the answer to the user.
     """
 
-    SIGNALS = (signal.SIGINT, signal.SIGTERM)
+    AT_ONCE: Mapping[signal.Signals, Any] = {
+        signal.SIGINT: signal.default_int_handler,
+        signal.SIGTERM: signal.SIG_DFL,
+    }
 
     def __init__(self, say: Callable[[str], None] = print) -> None:
         """Does nothing until it is entered.
@@ -33,7 +39,7 @@ class StopSignal:
 
     def __enter__(self) -> StopSignal:
         """Installs the handlers."""
-        self._previous = {number: signal.signal(number, self._handle) for number in self.SIGNALS}
+        self._previous = {number: signal.signal(number, self._handle) for number in self.AT_ONCE}
         return self
 
     def __exit__(self, *exc_info: object) -> None:
@@ -43,7 +49,7 @@ class StopSignal:
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         self.received = signal.Signals(number).name
-        for each, handler in self._previous.items():
+        for each, handler in self.AT_ONCE.items():
             signal.signal(each, handler)
         self._say(f"{self.received}: stopping after this {self.activity}; Ctrl-C again quits")
 
