@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
 from torchrl.objectives import SoftUpdate
 
 from bandit.collect import make_collector
@@ -21,7 +20,7 @@ from torchrl_aca.baselines import (
     TwinCritic,
 )
 from torchrl_aca.replay import make_replay_buffer, transitions, write_back
-from torchrl_aca.training.acceleration import make_adam
+from torchrl_aca.training.acceleration import descend, make_adam
 from torchrl_aca.training.randomness import seed_everything
 
 LOSSES: dict[str, type[DiffusionPolicyLoss]] = {
@@ -80,25 +79,20 @@ def train(cfg: BanditConfig, method: str, seed: int) -> DiffusionPolicy:
     best = {"best_action": "action"} if method == "dipo" else {}
     buffer = make_replay_buffer(collection.frames, cfg.optim.batch_size)
 
-    def step(losses: TensorDictBase, name: str) -> None:
-        optimizers[name].zero_grad()
-        losses[name].backward()
-        optimizers[name].step()
-
     collector = make_collector(cfg, loss.actor_network)
     for data in collector:
         buffer.extend(transitions(data, rewritten=best))
         for update in range(settings.updates_per_batch):
             batch = buffer.sample()
             batch["next_action"] = batch["action"]  # the last step needs none: spare the chain
-            step(loss.qvalue_loss(batch), "loss_qvalue")
+            descend(loss.qvalue_loss(batch), "loss_qvalue", optimizers["loss_qvalue"])
             if isinstance(loss, DACERLoss):
                 loss.step_scale()
             if isinstance(loss, DIPOLoss):
                 batch["best_action"] = loss.improve(batch)
                 write_back(buffer, batch, best)
             if update % settings.actor_interval == 0:
-                step(loss.actor_loss(batch), "loss_actor")
+                descend(loss.actor_loss(batch), "loss_actor", optimizers["loss_actor"])
                 target_update.step()
             for scheduler in schedulers:
                 scheduler.step()
