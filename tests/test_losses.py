@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import copy
-import functools
 import pickle
 import warnings
+from functools import partial
 
 import pytest
 import torch
@@ -455,7 +455,7 @@ COMPILED = [("aca", ("noise", "noise_level", "next_action")), *((name, ()) for n
 @pytest.mark.parametrize(("name", "given"), COMPILED)
 def test_compiled_losses_equal_eager_ones(name, given, monkeypatch):
     # A graph holds each iteration of DACER's mixture: few of them are compiled in seconds.
-    few = functools.partial(fit_gmm, num_iterations=3, num_start_iterations=2)
+    few = partial(fit_gmm, num_iterations=3, num_start_iterations=2)
     monkeypatch.setattr(dacer, "fit_gmm", few)
     torch.compiler.reset()  # the losses share code of TorchRL's, which recompiles a few times only
     case = CASES[name]

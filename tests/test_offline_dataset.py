@@ -328,7 +328,9 @@ def test_terminal_states_and_cut_recordings_may_lead_anywhere(tmp_path):
         each["next_observation"][-1] = 0
     cut = {**episode(3, seed=5), "complete": False}
     cut["next_observation"][-1] = 0
-    write(tmp_path / "data", [*episodes, cut])
+    data = write(tmp_path / "data", [*episodes, cut]).data
+    ends = [3, 7, 10]  # of 4, 4 and 3 rows
+    assert (data["next", "observation"][ends] == 0).all()
 
 
 @pytest.mark.parametrize(

@@ -14,14 +14,15 @@ STOPPED = 143  # exit status of a run that was told to stop; that of a shell for
 class StopSignal:
     """Turns the first Ctrl-C or SIGTERM into a wish to stop; a second one stops at once.
 
-    So it is where they were ignored before, too, as Ctrl-C is in what a script puts into the
-    background.
+    Both hold where signals were ignored before as well: a script's `&` makes its jobs ignore
+    Ctrl-C.
 
     Attributes:
         received: The signal's name, or None.
         activity: What the run is in the middle of, for the answer to the user.
     """
 
+    # What a second one does: Python's and the system's own, not the handlers of before.
     AT_ONCE: Mapping[signal.Signals, Any] = {
         signal.SIGINT: signal.default_int_handler,
         signal.SIGTERM: signal.SIG_DFL,
