@@ -55,7 +55,7 @@ NUM_JOBS = {
     "tiny": 1 * 2 * 2,  # tasks, methods, seeds
     "table2": 6 * 7 * 5,
     "short_chains": 2 * 9 * 2,
-    "rivals_short": 1 * 7 * 1,
+    "rivals_short": 2 * 7 * 2,
     "guidance_weight": 2 * 10 * 2,
     "num_steps": 2 * 5 * 2,
     "beyond": 2 * 3 * 2,
