@@ -15,10 +15,11 @@ from __future__ import annotations
 import hydra
 from omegaconf import DictConfig
 
+from data.offline import prepare_data
 from studies.jobs import StudyConfig, make_jobs, study_dir, write_study
 from studies.launchers import launch_jobs
 from studies.status import last_line, state_of, status_table
-from torchrl_aca.errors import RunError
+from torchrl_aca.errors import DatasetError, RunError
 from torchrl_aca.training.config import checked
 from torchrl_aca.training.signals import STOPPED, StopSignal
 
@@ -29,8 +30,11 @@ def run(cfg: StudyConfig) -> int:
     if cfg.status:
         print(status_table(jobs))
         return 0
-    write_study(cfg)
     open_jobs = [job for job in jobs if state_of(job).name not in ("done", "running")]
+    if cfg.study.recipe == "o2o_halfcheetah":
+        for job in open_jobs:  # here, as two jobs would make the same data at the same time
+            prepare_data(job.config)
+    write_study(cfg)
     print(f"{study_dir(cfg)}: {len(open_jobs)} of {len(jobs)} jobs to do", flush=True)
     failed = 0
     with StopSignal() as stop:
@@ -50,7 +54,7 @@ def run(cfg: StudyConfig) -> int:
 def main(cfg: DictConfig) -> None:
     try:
         failed = run(checked(StudyConfig, cfg))
-    except RunError as error:
+    except (DatasetError, RunError) as error:
         raise SystemExit(f"error: {error}") from None
     if failed:
         raise SystemExit(f"{failed} failed: output.txt of their directories says why")

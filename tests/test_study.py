@@ -184,6 +184,34 @@ def test_killed_and_bad_jobs_are_told_the_others_go_on_and_the_same_command_goes
     assert updates == [0, *range(30, 400, 30), 400]  # each once
 
 
+@pytest.mark.slow
+def test_data_are_made_once_before_the_jobs_and_missing_ones_are_told(tmp_path):
+    lengths = ["offline_updates=20", "online_frames=60", "collector.warmup_frames=300"]
+    study = {
+        "name": "mine",
+        "recipe": "o2o_halfcheetah",
+        "config": "o2o_quickstart",
+        "tasks": {"pendulum": ["dataset=mine", "generate.episodes=20"]},
+        "methods": {"rlpd": ["algo=rlpd"], "iql": ["algo=iql"]},
+        "seeds": [0],
+        "settings": [*lengths, "eval.episodes=1", "checkpoint.interval=25"],
+    }
+    (tmp_path / "study").mkdir()
+    (tmp_path / "study" / "mine.yaml").write_text(yaml.safe_dump(study))
+    command = ["--config-dir", str(tmp_path), "study=mine", "launcher.jobs=2"]
+
+    missing = 'study.tasks.pendulum=["dataset=mine","generate=null"]'
+    code, output, errors = run(*command, missing, cwd=tmp_path, recipe="study")
+    assert (code, output) == (1, "")
+    assert errors.startswith("error: mine: expected the directory of a data set, found nothing")
+    assert not (tmp_path / "runs").exists()
+
+    code, output, errors = run(*command, cwd=tmp_path, recipe="study")
+    assert code == 0, errors
+    assert output.count("generating mine") == 1
+    assert "2 done, 0 running, 0 stopped, 0 failed, 0 left" in output
+
+
 def test_the_page_has_every_key_with_its_default():
     rows = dict(
         re.findall(r"^\| `(\w+)` \| `(.+?)` \|", (ROOT / "docs/howto/study.md").read_text(), re.M)

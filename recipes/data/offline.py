@@ -87,6 +87,18 @@ def generate_missing(cfg: Any) -> None:
     make_dataset(checked(GeneratorConfig, without_methods(recipe, GeneratorConfig.model_fields)))
 
 
+def prepare_data(cfg: Any) -> None:
+    """Makes the data set of a run to come, or sees that it is there, without reading its rows.
+
+    Raises:
+        DatasetError: If there is none, or a file of it is missing.
+        RunError: As in `generate_missing`.
+    """
+    generate_missing(cfg)
+    if needs_data(cfg):
+        OfflineDataset.load(dataset_path(cfg))
+
+
 def load_offline_data(cfg: Any, env: EnvBase) -> OfflineDataset | None:
     """The data set, or None where neither phase has a minibatch with a part of it.
 
