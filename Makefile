@@ -60,11 +60,11 @@ format: $(INSTALLED)  ## repair style and format
 	$(VENV) -m ruff format .
 
 bench: $(INSTALLED)  ## measure speed and write results/speed.md (THREADS=2, OUT=another.md)
-	@$(WITH_TMPDIR) $(VENV) -m pytest benchmarks -q --benchmark-only --benchmark-json=$(CACHE)/speed.json $(ARGS)
-	@$(VENV) benchmarks/report.py $(CACHE)/speed.json $(OUT)
+	@$(WITH_TMPDIR) $(VENV) -m pytest benchmarks -q --benchmark-only --benchmark-json="$(CACHE)/speed.json" $(ARGS)
+	@$(VENV) benchmarks/report.py "$(CACHE)/speed.json" "$(OUT)"
 
 gpu:  ## on a machine with CUDA, with the torch of PYTHON: tests, speed, a short training -> results/gpu
-	PYTHONPATH=$(CURDIR):recipes:benchmarks $(PYTHON) benchmarks/gpu.py $(ARGS)
+	PYTHONPATH="$(CURDIR):recipes:benchmarks" $(PYTHON) benchmarks/gpu.py $(ARGS)
 
 clean:  ## remove caches and builds, keep .venv and outputs
 	rm -rf .cache docs/_build build dist *.egg-info

@@ -12,7 +12,6 @@ it writes that table first.
 
 from __future__ import annotations
 
-import csv
 import sys
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from omegaconf import OmegaConf
 from curves import make_panels
 from evaluations import by_setting, names, place_in_study, read_csv, read_study
 from figures import draw_settings
+from torchrl_aca.training.files import write_csv
 
 HERE = Path(__file__).parent
 # Of each study: the names of its methods, the label of the axis, and the paper's setting.
@@ -50,15 +50,16 @@ def draw_ablation(study: str, method: str, xlabel: str, default: float) -> None:
 def write_weights(study: Path) -> None:
     """Gathers the weights that tuned themselves from the runs of a study."""
     measured = ("updates", "guidance_weight", "candidate_spread", "guidance_gain")
+    rows = []
+    for path in sorted(study.glob("*-auto*/metrics.csv")):
+        config = OmegaConf.load(path.with_name("config.yaml"))
+        task, method = place_in_study(path.parent, config)
+        run = {"task": task, "method": method, "seed": config.seed}
+        rows += [{**run, **row} for row in read_csv(path)]
+    if not rows:
+        raise SystemExit(f"error: {study}: expected runs of methods named auto..., found none.")
     header = ("task", "method", "seed", *measured)
-    with open(HERE / "guidance_weight/weights.csv", "w", newline="") as file:
-        writer = csv.DictWriter(file, header, extrasaction="ignore")
-        writer.writeheader()
-        for path in sorted(study.glob("*-auto*/metrics.csv")):
-            config = OmegaConf.load(path.with_name("config.yaml"))
-            task, method = place_in_study(path.parent, config)
-            run = {"task": task, "method": method, "seed": config.seed}
-            writer.writerows({**run, **row} for row in read_csv(path))
+    write_csv(HERE / "guidance_weight/weights.csv", header, rows)
 
 
 def draw_weights() -> None:

@@ -45,7 +45,7 @@ def draw_mean(axes: Axes, label: str, runs: Sequence[Returns]) -> Line2D:
     places = shared(runs)
     values = [np.array([run[place] for run in runs]) for place in places]
     (line,) = axes.plot(places, [v.mean() for v in values], marker="o", markersize=3, label=label)
-    if len(runs) > 1:
+    if places and len(runs) > 1:
         low, high = zip(*(interval(mean, [v]) for v in values), strict=True)
         axes.fill_between(places, low, high, alpha=0.2, color=line.get_color(), linewidth=0)
     return line

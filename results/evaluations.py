@@ -10,7 +10,7 @@ import csv
 import json
 import re
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from curves import shared
+from torchrl_aca.training import files
 
 TEXT = ("method", "task", "commit")
 COLUMNS = [
@@ -46,13 +47,34 @@ Scores = dict[str, list[np.ndarray]]  # of each method, for each task
 def read_csv(path: Path) -> list[Row]:
     """The rows of a CSV file, numbers as numbers."""
     with open(path, newline="") as file:
-        rows = list(csv.DictReader(file))
-    return [{k: v if k in TEXT or not v else float(v) for k, v in row.items()} for row in rows]
+        return [numbers(path, row) for row in csv.DictReader(file)]
+
+
+def numbers(path: Path, row: Mapping[str, str]) -> Row:
+    """A row of a table with its numbers as numbers."""
+    return {name: _value(path, name, text) for name, text in row.items()}
+
+
+def _value(path: Path, name: str, text: str) -> Any:
+    if name in TEXT or not text:
+        return text
+    try:
+        return float(text)
+    except ValueError:
+        raise SystemExit(
+            f"error: {path}: expected a number in column {name}, got {text!r}. Mend it, or take "
+            "the column out."
+        ) from None
+
+
+def _rows_of_run(path: Path) -> list[Row]:
+    """The rows of a table that a run may still be writing."""
+    return [numbers(path, row) for row in files.read_csv(path)[1]]
 
 
 def read_evaluations(run_dir: Path) -> tuple[DictConfig, list[Row]]:
     """The configuration of a run, and its evaluations, those of an offline phase below zero."""
-    rows, config = read_csv(run_dir / "eval.csv"), OmegaConf.load(run_dir / "config.yaml")
+    rows, config = _rows_of_run(run_dir / "eval.csv"), OmegaConf.load(run_dir / "config.yaml")
     for row in rows:
         row["updates"] += row.get("offline_updates", 0) - _offline_updates(config)
     return config, rows
@@ -66,14 +88,24 @@ def _offline_updates(config: DictConfig) -> int:
 def read_study(source: Path) -> list[Row]:
     """Every evaluation of a study: its CSV, or the runs below its folder.
 
-    A run without an update is left out, and a column that a CSV lacks is empty.
+    A run without an update is left out, and a column that a CSV lacks is empty. Two runs of one
+    task, method and seed are an error: settings that differ need methods of their own.
     """
     if source.suffix == ".csv":
         return [dict.fromkeys(COLUMNS, "") | row for row in read_csv(source)]
-    rows = [row for path in sorted(source.rglob("eval.csv")) for row in read_run(path.parent)]
-    if not rows:
+    found: dict[Any, tuple[Path, list[Row]]] = {}
+    for path in sorted(source.rglob("eval.csv")):
+        for key, rows in by_run(read_run(path.parent)).items():
+            if key in found:
+                raise SystemExit(
+                    f"error: {found[key][0]} and {path.parent} are both {key[1]} on {key[0]} with "
+                    f"seed {key[2]}; expected one run of each. Move one of them away, or name "
+                    "them apart as methods of a study."
+                )
+            found[key] = path.parent, rows
+    if not found:
         raise SystemExit(f"error: {source}: expected directories of runs that have begun to train.")
-    return rows
+    return [row for _, rows in found.values() for row in rows]
 
 
 def read_studies(sources: Sequence[Path]) -> list[Row]:
@@ -89,7 +121,8 @@ def read_run(run_dir: Path) -> list[Row]:
     config, rows = read_evaluations(run_dir)
     if len({row["updates"] for row in rows}) < 2:
         return []
-    metrics = read_csv(run_dir / "metrics.csv") if (run_dir / "metrics.csv").exists() else []
+    path = run_dir / "metrics.csv"
+    metrics = _rows_of_run(path) if path.exists() else []
     speeds = [row["updates_per_second"] for row in metrics if row.get("updates_per_second")]
     (task, method), versions = place_in_study(run_dir, config), _versions(run_dir)
     own = {
@@ -152,7 +185,10 @@ def by_run(rows: Sequence[Row]) -> dict[Any, list[Row]]:
 
 def viewed(rows: Sequence[Row], x: str, value: str) -> list[Row]:
     """The rows with what is compared, `value`, and where, `x`; those without it are left out."""
-    return [row | {"x": row[x], "value": row[value]} for row in rows if row[value] != ""]
+    found = [row | {"x": row[x], "value": row[value]} for row in rows if row[value] != ""]
+    if not found:
+        raise SystemExit(f"error: no evaluation has a {value}. Compare another value.")
+    return found
 
 
 def by_seed(rows: Sequence[Row], task: str, method: str) -> dict[float, dict[float, float]]:
@@ -167,7 +203,12 @@ def by_seed(rows: Sequence[Row], task: str, method: str) -> dict[float, dict[flo
 def last_shared(rows: Sequence[Row], task: str) -> float:
     """The last place at which all runs of a task were evaluated."""
     runs = [run for m in names(rows, "method") for run in by_seed(rows, task, m).values()]
-    return shared(runs)[-1]
+    if not (places := shared(runs)):
+        raise SystemExit(
+            f"error: the runs of {task} have no evaluation at the same place. Leave out what has "
+            "hardly begun, or name places with --at."
+        )
+    return places[-1]
 
 
 def values_at(rows: Sequence[Row], task: str, method: str, place: float) -> np.ndarray:

@@ -19,7 +19,6 @@ which all its runs were evaluated, or `--at`, the last of which the scores are o
 from __future__ import annotations
 
 import argparse
-import csv
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -43,6 +42,7 @@ from evaluations import (
 )
 from figures import draw_points, draw_profiles
 from intervals import interquartile_mean, interval, mean, probability_of_improvement
+from torchrl_aca.training.files import write_csv
 
 PAPER = Path(__file__).parent / "paper.csv"
 Lines = dict[str, dict[str, float]]  # of each task: names and values
@@ -80,11 +80,11 @@ def cell(values: np.ndarray) -> str:
     return f"{number(values.mean())}{band} (n={len(values)})"
 
 
-def task_table(rows: Sequence[Row], places: Sequence[float], unit: str) -> str:
+def task_table(rows: Sequence[Row], places: Sequence[float], unit: str, beside: bool) -> str:
     """The paper's table: tasks by methods at some places, the last shared one where none is given.
 
-    The paper's own numbers stand below those at the same updates. What follows an underscore in a
-    method's name is a variant: `aca_n4` stands above the paper's `aca`.
+    `beside` puts the paper's own numbers below those at the same updates. What follows an
+    underscore in a method's name is a variant: `aca_n4` stands above the paper's `aca`.
     """
     methods, lines = names(rows, "method"), []
     for task in names(rows, "task"):
@@ -93,12 +93,12 @@ def task_table(rows: Sequence[Row], places: Sequence[float], unit: str) -> str:
             if not any(values):
                 continue
             lines.append([f"{task}, {place:,.0f} {unit}", *values])
-            if told := paper(task, place) if unit == "updates" else {}:
-                beside = [
+            if told := paper(task, place) if beside else {}:
+                theirs = [
                     told.get(m.split("_")[0], "") * bool(v)
                     for m, v in zip(methods, values, strict=True)
                 ]
-                lines.append(["*paper*", *beside])
+                lines.append(["*paper*", *theirs])
     return markdown(["", *methods], lines)
 
 
@@ -163,10 +163,7 @@ def draw_curves(rows: Sequence[Row], path: Path, labels: tuple[str, str], lines:
 def write_report(rows: Sequence[Row], out: Path, args: argparse.Namespace) -> str:
     """Writes the CSV, the figures and the card, and returns the card."""
     out.mkdir(parents=True, exist_ok=True)
-    with open(out / "evaluations.csv", "w", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS)
-        writer.writeheader()
-        writer.writerows(rows)
+    write_csv(out / "evaluations.csv", COLUMNS, rows)
     runs = runs_table(rows)
     rows = viewed(rows, args.x, args.value)
     named = {"return_mean": "mean return", "normalized_score": "normalised score"}[args.value]
@@ -175,7 +172,7 @@ def write_report(rows: Sequence[Row], out: Path, args: argparse.Namespace) -> st
         f"# {out.name}\n",
         f"{named.capitalize()} and 95 % bootstrap interval over n seeds; the paper's ± is a 95 % "
         "interval.\n",
-        task_table(rows, args.at, args.x),
+        task_table(rows, args.at, args.x, (args.x, args.value) == ("updates", "return_mean")),
         "\n![curves](curves.png)",
     ]
     tasks, found = scores(rows, args.at[-1] if args.at else None)

@@ -11,7 +11,7 @@ from data.config import OfflineToOnlineConfig
 from online_mujoco import train
 from recipe_cases import CONFIGS, composed, run
 from torchrl_aca.errors import RunError
-from torchrl_aca.training.config import RunConfig
+from torchrl_aca.training.config import RunConfig, override
 
 REFUSED = [
     ("aca.guidance_weight=abc", "aca.guidance_weight='abc': expected a valid number"),
@@ -262,3 +262,23 @@ def test_a_value_that_only_a_part_can_refuse_is_told_before_a_directory_is_made(
         with pytest.raises(RunError, match=message):
             train(cfg)
         assert not (tmp_path / "here").exists()
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        "runs/a-b.c",
+        "/a/env=hopper,seed=0",
+        "/a b/(x)",
+        "ü#&~",
+        "it's",
+        'a"b',
+        "a\\",
+        'a\\"b',
+        "a\\b",
+    ],
+)
+def test_an_override_has_its_value_whatever_the_characters(value):
+    typed = override("run_dir", value)
+    assert composed(typed).run_dir == value
+    assert typed == f"run_dir={value}" or typed[8] == typed[-1] == '"'

@@ -19,7 +19,7 @@ from loss_cases import (
 )
 from test_diffusion_losses import BATCH, EXACT, GAMMA, array, critics_of, make_data, unit
 from torchrl_aca import NoiseSchedule
-from torchrl_aca.baselines import DACERLoss, DiffusionPolicy, NoiseNetwork, TwinCritic
+from torchrl_aca.baselines import DACERLoss, DiffusionPolicy, DIPOLoss, NoiseNetwork, TwinCritic
 from torchrl_aca.baselines.dacer import distributional_error, running_scale
 from torchrl_aca.baselines.gmm import fit_gmm, gmm_entropy
 
@@ -301,6 +301,24 @@ def test_one_action_dimension_and_equal_critics():
     assert all(value.isfinite() for value in loss(data).values())
 
 
+def test_the_best_of_several_candidates_is_that_of_the_largest_mean():
+    policy = make_diffusion_policy(critic=make_dacer_critic(), num_candidates=4)
+    data = make_rlpd_data(BATCH)
+    draws = policy.draws(BATCH)
+    candidates = policy.denoise(data["observation"], draws[:-1])
+    features = policy.critic.encode(data["observation"])
+    means = policy.critic.evaluate(features, candidates)[..., 0]  # (N, B, E)
+    assert torch.equal(policy.values(data["observation"], candidates), means)
+    with torch.no_grad():
+        torch.manual_seed(3)
+        action = policy.sample(data["observation"])
+        torch.manual_seed(3)
+        chosen = policy.denoise(data["observation"], policy.draws(BATCH)[:-1])
+        best = policy.values(data["observation"], chosen).amin(-1).argmax(0)
+    assert torch.equal(action, policy.to_env(chosen[best, torch.arange(BATCH)]))
+    assert DACERLoss(policy, num_target_candidates=4)(data)["loss_qvalue"].isfinite()
+
+
 def test_an_update_reads_no_value_and_stays_on_its_device():
     """As a CUDA graph asks: on the device `meta`, which has no values, both would raise."""
     loss = DACERLoss(make_dacer().actor_network.to("meta"))
@@ -328,6 +346,10 @@ def test_settings_out_of_range_are_refused(kwargs, message):
         DACERLoss(policy, **kwargs)
 
 
-def test_critics_of_one_output_are_refused():
-    with pytest.raises(ValueError, match="a mean and a deviation; got critics of 1 outputs"):
-        DACERLoss(make_diffusion_policy(num_candidates=1))
+@pytest.mark.parametrize(("kind", "expected", "got"), [(DACERLoss, 2, 1), (DIPOLoss, 1, 2)])
+def test_critics_of_other_outputs_are_refused(kind, expected, got):
+    critic = TwinCritic(3, 2, num_outputs=got)
+    policy = DiffusionPolicy(NoiseNetwork(3, 2), NoiseSchedule.vp(20), critic=critic)
+    message = f"{kind.__name__} is for critics of num_outputs={expected}, got num_outputs={got}"
+    with pytest.raises(ValueError, match=message):
+        kind(policy)

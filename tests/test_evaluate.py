@@ -35,12 +35,12 @@ def evaluated(*overrides: str) -> list[dict[str, object]]:
 
 
 def test_the_summary_by_hand():
-    result = {"return_mean": 1.0, "return_std": 2.0, "num_episodes": 4.0, "episode_length": 7.0}
+    result = {"return_mean": 1.0, "return_std": 2.0, "num_episodes": 5.0, "episode_length": 7.0}
     row = summary(result, (-1.0, 3.0), seed=5)
-    assert row["standard_error"] == 1.0  # 2 / sqrt 4
+    assert row["standard_error"] == 1.0  # 2 / sqrt(5 - 1)
     assert (row["interval_low"], row["interval_high"]) == pytest.approx((-0.96, 2.96))
     assert row["normalized_score"] == 50.0  # half-way from -1 to 3
-    assert (row["episodes"], row["seed"], row["episode_length"]) == (4, 5, 7.0)
+    assert (row["episodes"], row["seed"], row["episode_length"]) == (5, 5, 7.0)
     assert summary(result, None, seed=5)["normalized_score"] == ""
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 import shutil
 import signal
 import time
@@ -112,24 +113,29 @@ def test_ctrl_c_leaves_a_checkpoint_that_resumes(unbroken, tmp_path):
     arguments = [
         *TINY_SAC,
         "optim.total_updates=100000",
-        "run_dir=here",
+        'run_dir="env=hopper, seed=0"',  # like a directory of --multirun
         "checkpoint.interval=100000",
     ]
+    here = tmp_path / "env=hopper, seed=0"
     process = start(*arguments, cwd=tmp_path)
     deadline = time.time() + 60
-    while not (tmp_path / "here" / "metrics.csv").exists() and time.time() < deadline:
+    while not (here / "metrics.csv").exists() and time.time() < deadline:
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)
     output, errors = process.communicate(timeout=60)
     assert process.returncode == STOPPED, errors
     assert "Traceback" not in errors
-    assert not (tmp_path / "here" / "done").exists()
-    stopped = int(re.search(r"stopped by SIGINT after (\d+) updates", output)[1])
-    assert f"python {SCRIPT} resume=here" in output
-    assert OmegaConf.load(tmp_path / "here" / "config.yaml").optim.total_updates == 100000
-    code, output, errors = run("resume=here", f"optim.total_updates={stopped + 5}", cwd=tmp_path)
+    assert not (here / "done").exists()
+    stopped, command = re.search(
+        r"by SIGINT after (\d+) updates; go on with: (.+)", output
+    ).groups()
+    assert OmegaConf.load(here / "config.yaml").optim.total_updates == 100000
+    program, script, *typed = shlex.split(command)
+    assert (program, Path(script)) == ("python", SCRIPT)
+    last = int(stopped) + 5
+    code, output, errors = run(*typed, f"optim.total_updates={last}", cwd=tmp_path)
     assert code == 0, errors
-    assert int(rows_of(tmp_path / "here" / "eval.csv")[-1]["updates"]) == stopped + 5
+    assert int(rows_of(here / "eval.csv")[-1]["updates"]) == last
 
 
 def test_a_second_ctrl_c_ends_the_run_at_once(tmp_path):

@@ -5,7 +5,14 @@ from __future__ import annotations
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import LazyTensorStorage, ListStorage, ReplayBuffer, TensorDictReplayBuffer
+from torchrl.data import (
+    LazyTensorStorage,
+    ListStorage,
+    ReplayBuffer,
+    SamplerWithoutReplacement,
+    TensorDictReplayBuffer,
+)
+from torchrl.envs.transforms import RewardScaling
 
 from recipe_cases import collected
 from torchrl_aca.replay import (
@@ -69,13 +76,17 @@ def test_rewritten_entries_reach_the_rows_that_were_sampled_and_no_others(num_ro
         (lambda: ReplayBuffer(storage=LazyTensorStorage(5)), "ReplayBuffer"),
         (lambda: TensorDictReplayBuffer(storage=ListStorage(5)), "TensorDictReplayBuffer"),
         (
+            lambda: TensorDictReplayBuffer(storage=LazyTensorStorage(5, ndim=2)),
+            "TensorDictReplayBuffer",
+        ),
+        (
             lambda: MixedReplayBuffer(
                 TensorDict(action=torch.zeros(3, 1), batch_size=[3]), make_replay_buffer(5, 2)
             ),
             "MixedReplayBuffer",
         ),
     ],
-    ids=["no index", "no tensors", "mixture"],
+    ids=["no index", "no tensors", "two dimensions", "mixture"],
 )
 def test_a_buffer_whose_rows_cannot_be_rewritten_is_refused(make, name):
     with pytest.raises(ValueError, match=f"the index of each row; got a {name}"):
@@ -98,6 +109,20 @@ def test_buffer_state_round_trip_when_partly_filled_full_and_wrapped(rows):
     torch.manual_seed(2)
     assert (expected == other.sample()).all()
     assert (buffer[:] == other[:]).all()
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ({"transform": RewardScaling(0.0, 0.5)}, "no transform"),
+        ({"sampler": SamplerWithoutReplacement()}, "uniform RandomSampler"),
+        ({"storage": LazyTensorStorage(20, ndim=2)}, "ndim=1"),
+    ],
+)
+def test_a_buffer_with_more_of_a_state_than_its_rows_is_refused(kind, message):
+    buffer = TensorDictReplayBuffer(**{"storage": LazyTensorStorage(20), "batch_size": 4} | kind)
+    with pytest.raises(ValueError, match=f"The saved buffer must have .*{message}"):
+        BufferState(buffer)
 
 
 def test_state_of_a_nearly_empty_buffer_is_small(tmp_path):

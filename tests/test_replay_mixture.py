@@ -360,6 +360,14 @@ def test_no_offline_half_needs_a_fraction_of_zero_and_keys():
             MixedReplayBuffer(None, online_buffer(), **arguments)
 
 
+def test_an_online_half_on_its_own_may_lie_on_another_device():
+    online = TensorDictReplayBuffer(storage=LazyTensorStorage(9, device="meta"))
+    whole = MixedReplayBuffer(None, online, offline_fraction=0, batch_size=2, keys=["action"])
+    for _ in range(2):
+        whole.extend(rows(3))
+    assert whole.sample()["action"].device.type == "meta"
+
+
 def mismatches():
     double = rows(4, dtype=FLOAT64)
     yield "dtype", double, "'observation' expected torch.float32.*got torch.float64"

@@ -16,6 +16,7 @@ pytest.importorskip("scipy")
 
 import evaluations  # noqa: E402
 import intervals  # noqa: E402
+from torchrl_aca.training.files import write_csv  # noqa: E402
 
 SCRIPT = Path(evaluations.__file__).with_name("report.py")
 
@@ -184,6 +185,8 @@ def test_scores_are_on_the_scale_of_their_task(study):
 def test_a_task_on_which_nothing_was_learned_has_no_scale(study):
     for method in ("aca", "narrow"):
         write_run(study, method, 0, {0: 5, 100000: 4}, task="Ant-v4")
+    spec = OmegaConf.load(study / "study.yaml")
+    OmegaConf.save({**spec, "tasks": {"Hopper-v4": [], "Ant-v4": []}}, study / "study.yaml")
     tasks, _ = evaluations.scores(rows_of(study), None)
     assert tasks == ["Hopper-v4"]
 
@@ -191,3 +194,65 @@ def test_a_task_on_which_nothing_was_learned_has_no_scale(study):
 def test_a_folder_without_runs_is_told(tmp_path):
     with pytest.raises(SystemExit, match="expected directories of runs that have begun"):
         evaluations.read_study(tmp_path)
+
+
+def test_two_runs_of_one_name_are_told_and_not_joined(tmp_path):
+    for folder, last in (("a", 2000), ("b", 5000)):
+        write_run(tmp_path / folder, "aca", 0, {0: 10, 100: last})
+    told = r"a/Hopper-v4-aca-s0 and .*b/Hopper-v4-aca-s0 are both aca on Hopper-v4 with seed 0"
+    with pytest.raises(SystemExit, match=told):
+        evaluations.read_study(tmp_path)
+
+
+def test_half_a_row_of_a_run_at_work_is_none(tmp_path):
+    write_run(tmp_path, "aca", 0, {0: 10, 100: 2000})
+    path = tmp_path / "Hopper-v4-aca-s0" / "eval.csv"
+    whole = evaluations.read_study(tmp_path)
+    path.write_bytes(path.read_bytes() + b"200,1000,7")
+    assert evaluations.read_study(tmp_path) == whole
+
+
+@pytest.mark.parametrize(
+    ("source", "options", "told"),
+    [
+        ("apart", [], "the runs of Hopper-v4 have no evaluation at the same place"),
+        ("study", ["--value", "normalized_score"], "no evaluation has a normalized_score"),
+        ("text.csv", [], "expected a number in column note, got 'good'"),
+    ],
+)
+def test_what_cannot_be_reported_is_told_and_nothing_is_written(
+    study, tmp_path, source, options, told
+):
+    write_run(tmp_path / "apart", "aca", 0, {0: 10, 100: 20})
+    write_run(tmp_path / "apart", "aca", 1, {50: 10, 150: 20})
+    (tmp_path / "text.csv").write_text(
+        "method,task,seed,updates,return_mean,note\naca,Hopper-v4,0,0,1,good\n"
+    )
+    call = [sys.executable, str(SCRIPT), str(tmp_path / source), str(tmp_path / "out"), *options]
+    done = subprocess.run(call, capture_output=True, text=True)
+    assert done.returncode == 1 and told in done.stderr and "Traceback" not in done.stderr
+    assert not (tmp_path / "out" / "card.md").exists()
+
+
+def test_a_column_of_ones_own_is_left_out_and_no_row_is_lost(study, tmp_path):
+    out = tmp_path / "out"
+    call = [sys.executable, str(SCRIPT), str(study), str(out)]
+    subprocess.run(call, capture_output=True, check=True)
+    path = out / "evaluations.csv"
+    call[2] = str(path)
+    subprocess.run(call, capture_output=True, check=True)
+    before = path.read_bytes()
+    header, *lines = path.read_text().splitlines()
+    path.write_text("\n".join([f"{header},mine", *(f"{line},7" for line in lines), ""]))
+    subprocess.run(call, capture_output=True, check=True)
+    assert path.read_bytes() == before
+
+
+def test_scores_have_no_returns_of_the_paper_below_them(study, tmp_path):
+    rows = [row | {"normalized_score": 9.0} for row in evaluations.read_study(study)]
+    write_csv(tmp_path / "scores.csv", evaluations.COLUMNS, rows)
+    call = [sys.executable, str(SCRIPT), str(tmp_path / "scores.csv"), str(tmp_path / "out")]
+    call += ["--value", "normalized_score"]
+    printed = subprocess.run(call, capture_output=True, text=True, check=True).stdout
+    assert "| Hopper-v4, 100,000 updates | 9.0 [9.0, 9.0] (n=2) |" in printed
+    assert "*paper*" not in printed

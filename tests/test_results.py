@@ -101,7 +101,7 @@ def test_updates_of_an_offline_phase_come_before_zero(plot, tmp_path):
     optim = {"utd_ratio": 1, "offline_updates": 20}
     run_dir = write_run(tmp_path / "a", {0: 1.0}, optim=optim)
     rows = ["updates,offline_updates,return_mean,return_std", "0,0,1,0", "0,20,2,0", "10,20,3,0"]
-    (run_dir / "eval.csv").write_text("\n".join(rows))
+    (run_dir / "eval.csv").write_text("\n".join([*rows, ""]))
     (curve,) = plot.make_curves([run_dir])
     assert plot.table([curve]).splitlines()[2:] == ["| -20 | 1 |", "| 0 | 2 |", "| 10 | 3 |"]
 
@@ -169,7 +169,12 @@ def test_the_figures_of_the_ablations(tmp_path, monkeypatch):
     monkeypatch.setattr(ablations, "HERE", tmp_path)
     monkeypatch.setattr(sys, "argv", ["ablations.py", str(runs)])
     ablations.main()
-    rows = (tmp_path / "guidance_weight/weights.csv").read_text().splitlines()
+    weights = (tmp_path / "guidance_weight/weights.csv").read_text()
+    monkeypatch.setattr(sys, "argv", ["ablations.py", str(tmp_path / "nowhere")])
+    with pytest.raises(SystemExit, match="nowhere: expected runs of methods named auto"):
+        ablations.main()
+    assert (tmp_path / "guidance_weight/weights.csv").read_text() == weights
+    rows = weights.splitlines()
     assert rows[1:] == ["Task-v1,auto5,0,10.0,20.0,0.1,0.2", "Task-v1,auto5,1,10.0,21.0,0.1,0.2"]
     weights = drawn.pop("guidance_weight/weights.png")
     assert [line.get_ydata() for line in weights.lines] == [[20.0], [21.0]]

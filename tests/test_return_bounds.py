@@ -111,6 +111,26 @@ def test_only_finished_episodes_come_out_whole_and_labelled(steps_per_call):
     torch.testing.assert_close(in_order(rows), in_order(expected))
 
 
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ({"tail": "masked"}, "Expected tail to be one of .*'mask'.*got 'masked'"),
+        ({"tail": "mask", "horizon": 0}, "Expected horizon >= 1, got horizon=0"),
+    ],
+)
+def test_a_wrong_setting_is_told(setting, message):
+    with pytest.raises(ValueError, match=message):
+        return_bounds(rows_of(), GAMMA, **setting)
+
+
+def test_bounds_are_made_where_the_data_are():
+    data = rows_of()
+    expected = return_bounds(data, GAMMA, tail="mask", horizon=2)
+    with torch.device("meta"):  # where a tensor that does not ask would go
+        bounds = return_bounds(data, GAMMA, tail="mask", horizon=2)
+    assert torch.equal(bounds, expected)
+
+
 def test_what_waits_is_saved_and_restored():
     pieces, _ = collected(1)
     whole, restored = FinishedEpisodes(label), FinishedEpisodes(label)

@@ -42,6 +42,18 @@ def test_jobs_are_named_by_task_method_and_seed_and_are_commands(study):
     assert jobs[3].config.optim.total_updates == 3000
 
 
+def test_the_directory_may_have_any_name(study):
+    job = study("study=tiny", "dir='/s = 1,(2)'")[0]
+    (word,) = (word for word in job.command if word.startswith("run_dir="))
+    assert composed(word).run_dir == str(job.dir) == "/s = 1,(2)/InvertedPendulum-v4-aca-s0"
+
+
+def test_a_launcher_takes_settings_as_the_page_has_them():
+    typed = ["study=tiny", "launcher=submitit", "launcher.parameters={slurm_partition:cpu}"]
+    cfg = checked(StudyConfig, composed(*typed, name="study"))
+    assert cfg.launcher.parameters == {"slurm_partition": "cpu"}
+
+
 def test_a_study_of_the_other_recipe_has_its_keys(study):
     job = study("study=offline_to_online", "dir=/s")[-1]
     assert job.command[1].endswith("o2o_halfcheetah.py")
@@ -191,16 +203,18 @@ def test_data_are_made_once_before_the_jobs_and_missing_ones_are_told(tmp_path):
         "name": "mine",
         "recipe": "o2o_halfcheetah",
         "config": "o2o_quickstart",
-        "tasks": {"pendulum": ["dataset=mine", "generate.episodes=20"]},
+        "tasks": {"pendulum": ["env=mine", "dataset=mine", "generate.episodes=20"]},
         "methods": {"rlpd": ["algo=rlpd"], "iql": ["algo=iql"]},
         "seeds": [0],
         "settings": [*lengths, "eval.episodes=1", "checkpoint.interval=25"],
     }
-    (tmp_path / "study").mkdir()
-    (tmp_path / "study" / "mine.yaml").write_text(yaml.safe_dump(study))
+    task = "# @package _global_\nenv: {name: InvertedPendulum-v4}\n"
+    for folder, text in (("study", yaml.safe_dump(study)), ("env", task)):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "mine.yaml").write_text(text)
     command = ["--config-dir", str(tmp_path), "study=mine", "launcher.jobs=2"]
 
-    missing = 'study.tasks.pendulum=["dataset=mine","generate=null"]'
+    missing = 'study.tasks.pendulum=["env=mine","dataset=mine","generate=null"]'
     code, output, errors = run(*command, missing, cwd=tmp_path, recipe="study")
     assert (code, output) == (1, "")
     assert errors.startswith("error: mine: expected the directory of a data set, found nothing")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import os
 import signal
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -21,10 +22,11 @@ from torchrl_aca.training.checkpoint import (
 )
 from torchrl_aca.training.due import has_reached, passed
 from torchrl_aca.training.files import replace_file, write_text
-from torchrl_aca.training.logging import CsvTable, MetricMeans
+from torchrl_aca.training.logging import CsvTable, MetricMeans, _wandb_id
 from torchrl_aca.training.randomness import RandomState, seed_everything
+from torchrl_aca.training.resume import is_finished, read_evaluations
 from torchrl_aca.training.run_dir import lock, make_run_dir, require_newest
-from torchrl_aca.training.signals import StopSignal
+from torchrl_aca.training.signals import STOPPED, StopSignal, run_command
 
 
 def rows_of(path):
@@ -229,10 +231,42 @@ def test_a_kill_while_a_table_is_rewritten_loses_no_row(tmp_path, monkeypatch):
     assert (tmp_path / "t.csv").read_text() == before
 
 
-def test_half_a_row_of_a_killed_process_is_dropped_on_resume(tmp_path):
-    (tmp_path / "t.csv").write_text("updates,frames,a\n1,5,0.5\nx")
+@pytest.mark.parametrize("half", ["x", "1", "2,10,0.2"])
+def test_half_a_row_of_a_killed_process_is_dropped_on_resume(tmp_path, half):
+    (tmp_path / "t.csv").write_text(f"updates,frames,a\n1,5,0.5\n{half}")
     table = CsvTable(tmp_path / "t.csv", {"updates": 9, "frames": 99})
     assert [row["updates"] for row in table.rows] == ["1"]
+
+
+def test_a_run_whose_tables_are_half_written_is_not_finished(tmp_path):
+    limits = SimpleNamespace(
+        optim=SimpleNamespace(total_updates=5), eval=SimpleNamespace(stop_return=None)
+    )
+    (tmp_path / "done").write_text("5\n")
+    for text, finished in (("", False), ("updates,a\n", False), ("updates,a\n5,", False)):
+        (tmp_path / "eval.csv").write_text(text)
+        assert is_finished(tmp_path, limits) is finished
+    (tmp_path / "eval.csv").write_text("updates,a\n5,1\n10")
+    assert is_finished(tmp_path, limits)
+    assert read_evaluations(tmp_path) == [{"updates": 5.0, "a": 1.0}]
+
+
+def test_a_command_that_is_told_to_stop_before_it_can_listen_has_stopped():
+    with StopSignal() as stop:
+        stop.received = "SIGTERM"
+        assert run_command(["sleep", "60"], stop) == STOPPED
+        stop.received = None
+        assert run_command(["sh", "-c", "kill -TERM $$"], stop) == -signal.SIGTERM
+
+
+def test_a_wandb_id_is_of_one_run_for_as_long_as_it_goes_on(tmp_path):
+    runs = [tmp_path / folder / "Hopper-v4-sac-s0" for folder in ("a", "b")]
+    for run_dir in runs:
+        run_dir.mkdir(parents=True)
+    first, other = (_wandb_id(run_dir, new=True) for run_dir in runs)
+    assert first != other
+    assert _wandb_id(runs[0], new=False) == first
+    assert _wandb_id(runs[0], new=True) not in (first, other)
 
 
 def test_the_first_signal_is_answered_at_once():

@@ -33,12 +33,12 @@ def check_choice(choices: Sequence[str], **values: str) -> None:
             raise ValueError(f"Expected {name} to be one of {tuple(choices)}, got {value!r}.")
 
 
-def first_parameter(critic: nn.Module) -> nn.Parameter:
+def first_parameter(network: nn.Module) -> nn.Parameter:
     """A parameter, which tells device and dtype; a ValueError where there is none to train."""
-    for parameter in critic.parameters():
+    for parameter in network.parameters():
         return parameter
     raise ValueError(
-        f"The critic must have parameters to train, got {type(critic).__name__} with none."
+        f"The network must have parameters to train, got {type(network).__name__} with none."
     )
 
 
@@ -48,14 +48,14 @@ def action_spec(spec: TensorSpec | None, key: NestedKey, action_dim: int | None)
     Args:
         spec: the action's spec, a ``Composite`` that holds it under ``key``, or None.
         key: the action's key.
-        action_dim: the critic's action size, where it tells one.
+        action_dim: the network's action size, where it tells one.
 
     Raises:
         ValueError: if the spec is not a bounded vector of ``action_dim`` floating-point numbers.
     """
     if spec is None:
         if action_dim is None:
-            raise ValueError("Pass spec= or action_dim=: the critic does not tell its action_dim.")
+            raise ValueError("Pass spec= or action_dim=: the network does not tell its action_dim.")
         return Unbounded(shape=(action_dim,))
     if isinstance(spec, Composite):
         if key not in spec.keys(True, True):
@@ -77,6 +77,6 @@ def action_spec(spec: TensorSpec | None, key: NestedKey, action_dim: int | None)
         )
     if action_dim not in (None, spec.shape[-1]):
         raise ValueError(
-            f"The critic has action_dim={action_dim}, the spec {spec.shape[-1]}: they must agree."
+            f"The network has action_dim={action_dim}, the spec {spec.shape[-1]}: they must agree."
         )
     return spec

@@ -14,6 +14,7 @@ from omegaconf import DictConfig
 from agents import AGENTS, without_methods
 from torchrl_aca.errors import RunError
 from torchrl_aca.training.checkpoint import list_checkpoints
+from torchrl_aca.training.config import override
 from torchrl_aca.training.resume import apply_overrides, is_finished, read_config, require_equal
 from torchrl_aca.training.signals import STOPPED, StopSignal, run_command
 
@@ -30,14 +31,14 @@ def finished_sac_run(env_name: str, seed: int, overrides: Sequence[str], run_dir
     Raises:
         RunError: If the run is another one than the configuration asks for, or was stopped.
     """
-    typed = [f"env.name={env_name}", f"seed={seed}", *overrides]
+    typed, here = [f"env.name={env_name}", f"seed={seed}", *overrides], override("run_dir", run_dir)
     try:
-        wanted = hydra.compose("dataset_sac", [*typed, f"run_dir={run_dir}"])
+        wanted = hydra.compose("dataset_sac", [*typed, here])
     except HydraException as error:
         raise RunError(f"sac.overrides: {str(error).splitlines()[0]}") from None
     stored = read_config(run_dir)
     if stored is None or not list_checkpoints(run_dir / "checkpoints"):
-        _run("--config-name", "dataset_sac", *typed, f"run_dir={run_dir}")
+        _run("--config-name", "dataset_sac", *typed, here)
     else:
         # A task's file may hold settings of other methods, which a run does not keep.
         own = without_methods(wanted, AGENTS["sac"].sections)
@@ -45,7 +46,7 @@ def finished_sac_run(env_name: str, seed: int, overrides: Sequence[str], run_dir
         apply_overrides(stored, wanted, [*typed, *ENDS])
         if not is_finished(run_dir, stored):
             ends = [f"{key}={_selected(wanted, key)}" for key in ENDS]
-            _run("--config-name", "dataset_sac", f"resume={run_dir}", *overrides, *ends)
+            _run("--config-name", "dataset_sac", override("resume", run_dir), *overrides, *ends)
     stored = read_config(run_dir)
     if stored is None or not is_finished(run_dir, stored):
         raise RunError(

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import hydra
+from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from pydantic import Field
@@ -16,7 +17,7 @@ from pydantic import Field
 from agents import configured
 from data.config import OfflineToOnlineConfig
 from torchrl_aca.errors import RunError
-from torchrl_aca.training.config import Count, RunConfig, Section, Seed
+from torchrl_aca.training.config import Count, RunConfig, Section, Seed, override
 
 FOLDER = Path(__file__).parents[1]
 
@@ -49,7 +50,7 @@ class Submitit(Section):
     name: Literal["submitit"]
     cluster: Literal["slurm", "local"]
     timeout_min: Count
-    parameters: dict[str, Any]
+    parameters: dict[str, Any] | None
 
 
 class Ray(Section):
@@ -137,18 +138,26 @@ def _jobs_of(cfg: StudyConfig, task: str, method: str) -> Iterator[Job]:
         config = configured(composed, schema)
     except (HydraException, RunError) as error:
         raise RunError(f"study={study.name}, {method} on {task}: {error}") from None
+    folders = [word for folder in _config_dirs() for word in ("--config-dir", folder)]
     for seed in study.seeds:
         run_dir = study_dir(cfg) / f"{task}-{method}-s{seed}"
         overrides = (
+            *folders,
             "--config-name",
             study.config,
             *chosen,
             f"num_threads={cfg.threads}",
             f"seed={seed}",
-            f"run_dir={run_dir}",
+            override("run_dir", run_dir),
             "existing=resume",
         )
         yield Job(method, run_dir, FOLDER / f"{study.recipe}.py", config, overrides)
+
+
+def _config_dirs() -> list[str]:
+    """The folders that `--config-dir` has added to this command, which its jobs need as well."""
+    entries = GlobalHydra.instance().config_loader().get_search_path().get_path()
+    return [e.path.removeprefix("file://") for e in entries if e.provider == "command-line"]
 
 
 def write_study(cfg: StudyConfig) -> None:

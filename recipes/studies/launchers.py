@@ -16,6 +16,7 @@ from typing import Any
 
 from studies.jobs import Job, Local, Ray, StudyConfig, Submitit, study_dir
 from torchrl_aca.errors import require
+from torchrl_aca.training.files import write_text
 from torchrl_aca.training.signals import STOPPED, StopSignal, run_command
 
 RECIPES = Path(__file__).parents[1]
@@ -49,7 +50,7 @@ def run_job(job: Job, threads: int, stop: StopSignal | None = None) -> int:
             stderr=subprocess.STDOUT,
             env={**os.environ, "OMP_NUM_THREADS": str(threads)},
         )
-    job.exit_status.write_text(f"{code}\n")
+    write_text(job.exit_status, f"{code}\n")
     return code
 
 
@@ -100,7 +101,7 @@ def submit(settings: Submitit, jobs: Sequence[Job], threads: int, folder: Path) 
         folder, cluster=settings.cluster
     )
     executor.update_parameters(timeout_min=settings.timeout_min, cpus_per_task=threads)
-    executor.update_parameters(**settings.parameters)
+    executor.update_parameters(**settings.parameters or {})
     with executor.batch():
         for job in jobs:
             executor.submit(SubmittedJob(job, threads))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,6 +9,7 @@ from datetime import timedelta
 from statistics import fmean
 
 from studies.jobs import Job
+from torchrl_aca.training.files import read_csv
 from torchrl_aca.training.resume import is_finished, read_evaluations
 from torchrl_aca.training.run_dir import is_locked
 from torchrl_aca.training.signals import STOPPED
@@ -55,8 +55,7 @@ def _progress(job: Job) -> tuple[int, float]:
     path = job.dir / "metrics.csv"
     if not path.is_file():
         return 0, 0.0
-    with open(path, newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row.get("updates_per_second")]  # whole rows
+    _, rows = read_csv(path)
     if not rows:
         return 0, 0.0
     updates = int(rows[-1]["updates"]) + int(rows[-1].get("offline_updates") or 0)

@@ -77,6 +77,7 @@ class DACERLoss(DiffusionPolicyLoss):
         "entropy",
         "exploration_std",
     )
+    num_outputs = 2  # mean and standard deviation
     target_entropy: Tensor
     scale: Tensor
     next_scale: Tensor
@@ -95,11 +96,6 @@ class DACERLoss(DiffusionPolicyLoss):
         check_at_least(1, num_components=num_components)
         check_at_least(num_components, num_entropy_samples=num_entropy_samples)
         check_above(0, scale_tau=scale_tau)
-        if getattr(actor_network.critic, "num_outputs", 2) != 2:
-            raise ValueError(
-                "DACER's critics tell a mean and a deviation; got critics of "
-                f"{actor_network.critic.num_outputs} outputs. Build them with num_outputs=2."
-            )
         super().__init__(actor_network, **kwargs)
         self.log_alpha = actor_network.log_alpha
         self.num_entropy_samples = num_entropy_samples

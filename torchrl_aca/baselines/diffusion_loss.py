@@ -48,10 +48,11 @@ class DiffusionPolicyLoss(TDLoss):
 
     Attributes:
         needs_schedule: whether the policy has to have a denoising chain, and so a schedule.
+        num_outputs: numbers that each critic has to give.
 
     Raises:
-        ValueError: if the policy has no critics, or not the chain that the loss needs, or a number
-            is out of range.
+        ValueError: if the policy has no critics, or not those or the chain that the loss needs, or
+            a number is out of range.
     """
 
     @dataclass
@@ -83,6 +84,7 @@ class DiffusionPolicyLoss(TDLoss):
         priority_weight: NestedKey = "priority_weight"
 
     needs_schedule = True
+    num_outputs = 1
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
     loss_names: tuple[str, ...] = ("loss_qvalue", "loss_actor")
@@ -109,6 +111,12 @@ class DiffusionPolicyLoss(TDLoss):
         super().__init__()
         if actor_network.critic is None:
             raise ValueError("The policy must have critics: build it with critic=... .")
+        got = getattr(actor_network.critic, "num_outputs", self.num_outputs)
+        if got != self.num_outputs:
+            raise ValueError(
+                f"{type(self).__name__} is for critics of num_outputs={self.num_outputs}, got "
+                f"num_outputs={got}. Build them with that."
+            )
         if self.needs_schedule and actor_network.schedule is None:
             raise ValueError(
                 f"{type(self).__name__} is for denoising chains: build the policy with a "

@@ -199,13 +199,17 @@ class DiffusionPolicy(ChainPolicy):
 
     @torch.no_grad()
     def values(self, observation: Tensor, candidates: Tensor) -> Tensor:
-        """Critic values of candidates ``(N, B, A)`` in [-1, 1] units, shape ``(N, B, E)``."""
+        """Critic values of candidates ``(N, B, A)`` in [-1, 1] units, shape ``(N, B, E)``.
+
+        Of critics with several outputs it is the first: the mean of the return.
+        """
         features = self.critic.encode(observation)
         tiles = chain.tiles(candidates, self.tile_rows, dim=0)
         return torch.cat([self._run(self._values, features, tile) for tile in tiles])
 
     def _values(self, features: Any, candidates: Tensor) -> Tensor:
-        return self.critic.evaluate(features, candidates)
+        values = self.critic.evaluate(features, candidates)
+        return values if values.ndim == candidates.ndim else values[..., 0]
 
     # --- acting -----------------------------------------------------------------------------------
 

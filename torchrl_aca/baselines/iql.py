@@ -131,7 +131,7 @@ class EnsembleIQLLoss(EnsembleTDLoss):
         """Expectile loss of the state value."""
         value = self._state_value(tensordict)
         advantage = self._target_value(tensordict) - value
-        weight = torch.where(advantage < 0, 1 - self.expectile, self.expectile)
+        weight = (self.expectile - (advantage < 0).to(advantage.dtype)).abs()
         error, metrics = weight * advantage.square(), {"state_value": value.detach().mean()}
         return self._output("loss_value", error, tensordict, metrics)
 

@@ -57,7 +57,7 @@ class SDACLoss(OpenLoopAlpha, DiffusionPolicyLoss):
 
     Differences from the authors' code: it evaluates ``eps`` once for each of the ``K`` noises and
     weighs the errors. All are at the same ``a_t``, so the gradient is that of the one error from
-    the average, ``K`` times over, which Adam does not see: here the network is evaluated once.
+    the average, divided by ``K``, which Adam does not see: here the network is evaluated once.
 
     Args:
         actor_network: the policy, with its critics and its ``log_alpha``.

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from torchrl_aca.checks import check_at_least, check_choice
 from torchrl_aca.errors import DatasetError
 from torchrl_aca.offline.dataset import returns_to_go
 
@@ -15,7 +16,8 @@ Tail = Literal["truncate", "mask", "bootstrap_rate"]
 
 
 def check_tail(tail: Tail, gamma: float) -> None:
-    """Raises `ValueError` if the last reward for ever has no finite sum."""
+    """Raises `ValueError` if there is no such tail, or it has no finite sum."""
+    check_choice(get_args(Tail), tail=tail)
     if tail == "bootstrap_rate" and gamma >= 1:
         raise ValueError(f"tail='bootstrap_rate' needs gamma below 1, got gamma={gamma}.")
 
@@ -49,6 +51,7 @@ def return_bounds(
         ValueError: If a setting is out of range.
     """
     check_tail(tail, gamma)
+    check_at_least(1, horizon=horizon)
     if not data["next", "done"].any():
         raise DatasetError(
             f"none of {len(data)} rows ends an episode (next.done), so returns to go are unknown; "
@@ -78,6 +81,7 @@ def _ends(data: TensorDictBase) -> Tensor:
 
 def _near_a_cut(ends: Tensor, cut: Tensor, horizon: int) -> Tensor:
     """Which rows are among the last `horizon` of an episode that was cut, (n,)."""
-    places, rows = ends.nonzero().squeeze(-1), torch.arange(len(ends))
+    places = ends.nonzero().squeeze(-1)
+    rows = torch.arange(len(ends), device=ends.device)
     end_of = places[torch.searchsorted(places, rows)]
     return cut[end_of] & (end_of - rows < horizon)

@@ -144,7 +144,8 @@ def returns_to_go(data: TensorDictBase, gamma: float) -> torch.Tensor:
     for step, done in zip(reversed(rewards), reversed(dones), strict=True):
         value = step if done else step + gamma * value
         values.append(value)
-    return torch.tensor(values[::-1], dtype=torch.float64).to(reward).reshape(reward.shape)
+    returns = torch.tensor(values[::-1], dtype=torch.float64, device=reward.device)
+    return returns.to(reward.dtype).reshape(reward.shape)
 
 
 def _read_metadata(path: Path) -> dict[str, Any]:

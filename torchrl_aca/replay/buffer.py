@@ -10,6 +10,8 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.data import LazyTensorStorage, ReplayBuffer, TensorDictReplayBuffer, TensorStorage
 
+from torchrl_aca.replay.rows import require_plain
+
 __all__ = [
     "TRANSITION_KEYS",
     "BufferState",
@@ -59,10 +61,12 @@ def require_index(buffer: Any) -> None:
         ValueError: If its batches have no "index", or its rows cannot be written one by one.
     """
     storage = getattr(buffer, "storage", None)
-    if not isinstance(buffer, TensorDictReplayBuffer) or not isinstance(storage, TensorStorage):
+    one_by_one = isinstance(storage, TensorStorage) and storage.ndim == 1
+    if not isinstance(buffer, TensorDictReplayBuffer) or not one_by_one:
         raise ValueError(
-            "rows can be rewritten in a TensorDictReplayBuffer with a TensorStorage alone, whose "
-            f"batches hold the index of each row; got a {type(buffer).__name__}."
+            "rows can be rewritten in a TensorDictReplayBuffer with a TensorStorage of ndim=1 "
+            f"alone, whose batches hold the index of each row; got a {type(buffer).__name__} with "
+            f"{storage!r}."
         )
 
 
@@ -78,10 +82,16 @@ def write_back(
 
 
 class BufferState:
-    """The filled part of a replay buffer, for checkpoints."""
+    """The filled part of a plain replay buffer, for checkpoints.
+
+    Raises:
+        ValueError: If there is more that the next batches depend on: a sampler with a state of its
+            own, a transform, or a storage that is not of one dimension.
+    """
 
     def __init__(self, buffer: ReplayBuffer, keys: Sequence[NestedKey] = TRANSITION_KEYS) -> None:
         """Takes the buffer, which is only read when a state is asked for, and the keys to keep."""
+        require_plain(buffer, "saved")
         self.buffer, self.keys = buffer, keys
 
     def state_dict(self) -> dict[str, Any]:
@@ -92,7 +102,7 @@ class BufferState:
         size = len(self.buffer)
         if size == 0:  # a storage that is allocated lazily cannot be read yet
             return {}
-        rows = self.buffer[:size].select(*self.keys, strict=False).flatten_keys(".")
+        rows = self.buffer.storage[:size].select(*self.keys, strict=False).flatten_keys(".")
         if size < self.buffer.storage.max_size:
             # A view would be written with the whole, mostly empty storage behind it.
             rows = rows.clone()

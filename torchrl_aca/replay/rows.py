@@ -36,7 +36,7 @@ def rows_of(offline: TensorDictBase | ReplayBuffer | None) -> TensorDictBase:
 
 
 def require_plain(buffer: ReplayBuffer, name: str) -> None:
-    """Refuse what reading a buffer's rows uniformly and from the storage would pass over.
+    """Refuse what reading and writing rows in the storage, and drawing uniformly, pass over.
 
     Raises:
         ValueError: naming the sampler, storage or transform.
@@ -45,8 +45,8 @@ def require_plain(buffer: ReplayBuffer, name: str) -> None:
     if not isinstance(sampler, RandomSampler):
         raise ValueError(
             f"The {name} buffer must have TorchRL's uniform RandomSampler, got "
-            f"{type(sampler).__name__}: rows are drawn uniformly here, so priorities or slices "
-            "would be ignored. Use TensorDictReplayBuffer(storage=LazyTensorStorage(n))."
+            f"{type(sampler).__name__}: its order, priorities or slices would be passed over. "
+            "Use TensorDictReplayBuffer(storage=LazyTensorStorage(n))."
         )
     if not isinstance(storage, TensorStorage) or storage.ndim != 1:
         raise ValueError(
@@ -55,8 +55,9 @@ def require_plain(buffer: ReplayBuffer, name: str) -> None:
         )
     if len(buffer.transform):
         raise ValueError(
-            f"The {name} buffer must have no transform, got {buffer.transform}: it would reach one "
-            "half alone. Apply it to the data before, or to the batch that is sampled."
+            f"The {name} buffer must have no transform, got {buffer.transform}: rows are read from "
+            "the storage and written to it, past the transform. Apply it to the data before, or to "
+            "the batch that is sampled."
         )
 
 

@@ -201,6 +201,16 @@ def checked(schema: type[Schema], cfg: DictConfig | dict[str, Any]) -> Schema:
         raise RunError("\n       ".join(dict.fromkeys(map(_told, error.errors())))) from None
 
 
+def override(key: str, value: object) -> str:
+    """`key=value` as Hydra reads it from a command, whatever characters the value has."""
+    text = str(value)
+    if re.fullmatch(r"[\w./+@-]+", text, re.ASCII):
+        return f"{key}={text}"
+    # Within quotes a backslash is one, but for those in front of a quote.
+    escaped = re.sub(r'(\\*)("|$)', lambda m: 2 * m[1] + m[2].replace('"', '\\"'), text)
+    return f'{key}="{escaped}"'
+
+
 def _told(error: ErrorDetails) -> str:
     """One mistake in one sentence: key, got, expected."""
     context = error.get("ctx", {})

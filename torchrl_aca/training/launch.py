@@ -14,6 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_aca.errors import DatasetError, RunError
 from torchrl_aca.training.checkpoint import list_checkpoints, read_checkpoint
+from torchrl_aca.training.files import write_text
 from torchrl_aca.training.resume import (
     continued_config,
     is_finished,
@@ -60,7 +61,7 @@ def launch(train: Train, cfg: DictConfig) -> None:
 def start(train: Train, cfg: DictConfig, overrides: Iterable[str]) -> Path:
     """Trains from where the run is, unless it is finished, and returns its directory."""
     if cfg.resume is not None:
-        return train(*resumed_config(cfg, overrides))
+        return _go_on(train, *resumed_config(cfg, overrides))
     if cfg.existing != "resume" or cfg.run_dir is None:
         return train(cfg, None)
     run_dir = Path(cfg.run_dir)
@@ -73,7 +74,18 @@ def start(train: Train, cfg: DictConfig, overrides: Iterable[str]) -> Path:
             print(f"{run_dir} is finished: nothing to do", flush=True)
             return run_dir
     checkpoint = read_checkpoint(run_dir)
-    return train(continued_config(cfg, OmegaConf.create(checkpoint["config"])), checkpoint)
+    stored = OmegaConf.create(checkpoint["config"])
+    return _go_on(train, continued_config(cfg, stored), checkpoint)
+
+
+def _go_on(train: Train, cfg: DictConfig, checkpoint: dict[str, Any]) -> Path:
+    """Trains from a checkpoint, but for a run that was killed between its last one and its end."""
+    run_dir, updates = Path(cfg.resume), checkpoint["parts"]["counters"]["updates"]
+    if updates < cfg.optim.total_updates or (run_dir / DONE).exists():
+        return train(cfg, checkpoint)
+    write_text(run_dir / DONE, f"{updates}\n")
+    print(f"{run_dir} has all its {updates} updates: nothing to do", flush=True)
+    return run_dir
 
 
 def make_device(cfg: Any) -> torch.device:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import csv
-import io
 import math
+import uuid
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from torchrl.record.loggers import get_logger
 
 from torchrl_aca.errors import RunError
 from torchrl_aca.training.config import Logger
-from torchrl_aca.training.files import write_text
+from torchrl_aca.training.files import read_csv, write_csv, write_text
 
 
 class MetricMeans:
@@ -72,10 +72,8 @@ class CsvTable:
         self.columns: list[str] = []
         self.rows: list[dict[str, Any]] = []
         if until is not None and path.exists():
-            with open(path, newline="") as file:
-                reader = csv.DictReader(file)
-                self.columns = list(reader.fieldnames or [])
-                self.rows = [row for row in reader if not _is_later(row, until)]
+            self.columns, rows = read_csv(path)
+            self.rows = [row for row in rows if not _is_later(row, until)]
             self._rewrite()
 
     def append(self, row: Mapping[str, Any]) -> None:
@@ -90,17 +88,13 @@ class CsvTable:
 
     def _rewrite(self) -> None:
         """Replaces the file, so that a kill leaves the rows that were there."""
-        text = io.StringIO(newline="")
-        writer = csv.DictWriter(text, self.columns)
-        writer.writeheader()
-        writer.writerows(self.rows)
-        write_text(self.path, text.getvalue())
+        write_csv(self.path, self.columns, self.rows)
 
 
 def _is_later(row: Mapping[str, str | None], until: Mapping[str, int]) -> bool:
     try:
         return any(int(row.get(name) or 0) > last for name, last in until.items())
-    except ValueError:  # half a row, written by a process that was killed
+    except ValueError:  # half a row of a full disk, with another one behind it
         return True
 
 
@@ -139,8 +133,7 @@ class RunLogger:
                 run_dir.name,
                 wandb_kwargs={
                     "project": settings["project"],
-                    # The run's name as id: a resumed run goes on in the same place.
-                    "id": run_dir.name,
+                    "id": _wandb_id(run_dir, new=until is None),
                     "offline": offline,
                     "mode": settings["wandb_mode"],
                     "config": dict(config),
@@ -171,6 +164,14 @@ class RunLogger:
             if hasattr(experiment, end):
                 getattr(experiment, end)()
                 break
+
+
+def _wandb_id(run_dir: Path, new: bool) -> str:
+    """An id that no other run has, kept for the time when this one is resumed."""
+    path = run_dir / "wandb_id"
+    if new or not path.exists():
+        write_text(path, uuid.uuid4().hex)
+    return path.read_text()
 
 
 def require_wandb_login(settings: Logger) -> None:

@@ -84,10 +84,17 @@ def restore_parts(
 
 
 def as_stateful(buffer: Any, agent: Agent) -> Stateful:
-    """Returns what saves a buffer: TorchRL's own state would hold the empty part as well."""
+    """Returns what saves a buffer: TorchRL's own state would hold the empty part as well.
+
+    Raises:
+        RunError: If the buffer has more of a state than its rows.
+    """
     if not isinstance(buffer, ReplayBuffer):
         return buffer
-    return BufferState(buffer, (*TRANSITION_KEYS, *agent.extra_keys, *agent.rewrites))
+    try:
+        return BufferState(buffer, (*TRANSITION_KEYS, *agent.extra_keys, *agent.rewrites))
+    except ValueError as error:
+        raise RunError(str(error)) from error
 
 
 def check_rows(state: Mapping[str, Any], collection: Collection) -> None:

@@ -83,8 +83,7 @@ def write_card(
         "seed": config["seed"],
         "updates": last["updates"],
         "environment frames": f"{last['frames']} (warm-up included)",
-        "final return": f"{float(last['return_mean']):.1f} ± {standard_error(last):.1f} "
-        f"(mean ± standard error of {float(last['num_episodes']):.0f} episodes)",
+        "final return": _told(last),
         **scores,
         **facts,
         "wall-clock time": f"{seconds / 60:.1f} min",
@@ -100,6 +99,15 @@ def write_card(
     write_text(run_dir / "card.md", text)
 
 
+def _told(evaluation: Mapping[str, Any]) -> str:
+    """An evaluation's mean, with its standard error where there are several episodes."""
+    mean, episodes = (float(evaluation[name]) for name in ("return_mean", "num_episodes"))
+    if episodes < 2:
+        return f"{mean:.1f} (one episode)"
+    error = standard_error(evaluation)
+    return f"{mean:.1f} ± {error:.1f} (mean ± standard error of {episodes:.0f} episodes)"
+
+
 def _stored_versions(run_dir: Path) -> dict[str, Any]:
     """What a run began with; nothing where the file has been lost since."""
     try:
@@ -109,8 +117,11 @@ def _stored_versions(run_dir: Path) -> dict[str, Any]:
 
 
 def standard_error(evaluation: Mapping[str, Any]) -> float:
-    """Returns the standard error of `return_mean`, from the spread over the episodes."""
-    return float(evaluation["return_std"]) / float(evaluation["num_episodes"]) ** 0.5
+    """Returns the standard error of `return_mean` over two episodes or more, unbiased.
+
+    `return_std` is the spread of these very episodes, and so that over the root of n - 1.
+    """
+    return float(evaluation["return_std"]) / (float(evaluation["num_episodes"]) - 1) ** 0.5
 
 
 def plot_curve(run_dir: Path, title: str, evaluations: Sequence[Mapping[str, Any]]) -> None:

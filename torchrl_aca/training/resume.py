@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 from torchrl_aca.errors import RunError
 from torchrl_aca.training.checkpoint import read_checkpoint
 from torchrl_aca.training.due import has_reached
+from torchrl_aca.training.files import read_csv
 from torchrl_aca.training.run_dir import DONE
 
 MAY_CHANGE_ON_RESUME = (
@@ -86,7 +86,7 @@ def is_finished(run_dir: Path, cfg: Any) -> bool:
     if not (run_dir / DONE).exists():
         return False
     rows = read_evaluations(run_dir)
-    updates = rows[-1]["updates"]
+    updates = rows[-1]["updates"] if rows else 0
     return updates >= cfg.optim.total_updates or has_reached(rows, cfg.eval.stop_return)
 
 
@@ -95,8 +95,8 @@ def read_evaluations(run_dir: Path) -> list[dict[str, float]]:
     path = run_dir / "eval.csv"
     if not path.is_file():
         return []
-    with open(path, newline="") as file:
-        return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
+    _, rows = read_csv(path)
+    return [{name: float(value) for name, value in row.items()} for row in rows]
 
 
 def read_config(run_dir: Path) -> DictConfig | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -18,7 +19,7 @@ from torchrl_aca.replay import write_back
 from torchrl_aca.training.agent import Agent
 from torchrl_aca.training.checkpoint import Counters, save_checkpoint
 from torchrl_aca.training.collection import BadDataError, Collection
-from torchrl_aca.training.config import RunConfig
+from torchrl_aca.training.config import RunConfig, override
 from torchrl_aca.training.due import has_reached, is_better, passed, updates_due
 from torchrl_aca.training.files import write_text
 from torchrl_aca.training.logging import MetricMeans, RunLogger
@@ -73,7 +74,7 @@ class Run:
         Args:
             cfg: The whole configuration.
             agent: What is trained.
-            buffer: A replay buffer, or a mixture that saves itself; `sample()` gives a batch.
+            buffer: A plain replay buffer, or a mixture that saves itself; `sample()` gives a batch.
             collection: Where experience comes from.
             evaluate: Evaluates the policy; takes what is to be told after each step.
             checkpoint: What `read_checkpoint` returned, to go on from.
@@ -313,19 +314,20 @@ class Run:
         self._speed()
         if self._saved != (self.counters.total, self.collection.frames):
             self.save()
+        if self.completed:  # at once after the checkpoint: a kill from here on costs no update
+            write_text(self.dir / DONE, f"{self.counters.updates}\n")
         rows = self.logger.tables["eval"].rows
         title = f"{self.cfg.algo.name} on {self.cfg.env.name}"
         write_card(self.dir, self.config, rows, self.counters.seconds, self.facts)
         plot_curve(self.dir, title, rows)
         if self.completed:
-            write_text(self.dir / DONE, f"{self.counters.updates}\n")
             before, after = (float(row["return_mean"]) for row in (rows[0], rows[-1]))
             self.bar.write(f"mean evaluation return: before {before:.1f}, after {after:.1f}")
         else:
             self._tell_stop(f"by {self._signal.received or 'the loop'}", "go on")
 
     def _tell_stop(self, how: str, next_step: str) -> None:
+        command = shlex.join(["python", self.script, override("resume", self.dir)])
         self.bar.write(
-            f"stopped {how} after {self.counters.total} updates; {next_step} with: "
-            f"python {self.script} resume={self.dir}"
+            f"stopped {how} after {self.counters.total} updates; {next_step} with: {command}"
         )

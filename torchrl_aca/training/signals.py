@@ -64,7 +64,8 @@ def run_command(command: Sequence[str], stop: StopSignal, **options: Any) -> int
         options: For `subprocess.Popen`.
 
     Returns:
-        The exit status; that of a program which a signal has killed is negative.
+        The exit status; that of a program which a signal has killed is negative, but `STOPPED` for
+        one that was told so before it could listen.
     """
     # A session of its own: Ctrl-C reaches it once, through this process.
     process = subprocess.Popen(command, start_new_session=True, **options)
@@ -75,7 +76,8 @@ def run_command(command: Sequence[str], stop: StopSignal, **options: Any) -> int
                 process.terminate()
                 told = True
             try:
-                return process.wait(timeout=0.2)
+                code = process.wait(timeout=0.2)
+                return STOPPED if told and code == -signal.SIGTERM else code
             except subprocess.TimeoutExpired:
                 continue
     except BaseException:
