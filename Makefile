@@ -8,7 +8,7 @@ SHELL := bash
 .DEFAULT_GOAL := help
 
 VENV := .venv/bin/python
-INSTALLED := .venv/.installed
+INSTALLED := .venv/.installed-$(EXTRAS)
 CACHE := $(CURDIR)/.cache
 
 export XDG_CACHE_HOME := $(CACHE)

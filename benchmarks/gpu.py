@@ -83,7 +83,8 @@ def table(device: torch.device, cases: Sequence[Case], seconds: float) -> Iterat
         try:
             acting, update = measure(case, device, seconds)
         except Exception as error:  # a defect of one variant must not hide the others
-            yield f"{start} failed: {type(error).__name__}: {str(error).splitlines()[0]} | | |"
+            first, *_ = [*str(error).splitlines(), ""]
+            yield f"{start} failed: {type(error).__name__}: {first} | | |"
             continue
         yield f"{start} {1e3 * acting:.2f} ms | {1e3 * update:.2f} ms | {1 / update:.0f} |"
 

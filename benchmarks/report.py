@@ -8,7 +8,6 @@ from pathlib import Path
 
 from torchrl_aca.training.report import versions
 
-ROOFLINE_ROWS = {"acting, 5": 160, "acting, 1 states x 32": 32}
 HEADER = """# Speed
 
 Written by `make bench`. Medians of one run; compare ratios, not times of different machines.
@@ -17,20 +16,13 @@ Written by `make bench`. Medians of one run; compare ratios, not times of differ
   once (`benchmarks/yardstick.py`). *eager*, *compiled*: this package, `compile_step=False` and
   `True`.
 - *yardstick / this*: how many times as fast as the yardstick in the same run.
-- *of roofline*: matrix products of the chain, per second, over what a bare matrix product of the
-  same number of rows does in the same run. It counts the arithmetic that a chain needs, so an
-  update, which also has two optimiser steps, cannot reach it. The last step of a chain needs none.
+- *of roofline*: matrix products of the chain, per second, over what a bare matrix product of as
+  many rows as this package takes at once does in the same run, where one was timed. It counts the
+  arithmetic that a chain needs, so an update, which also has two optimiser steps, cannot reach it.
+  The last step of a chain needs none.
 - *iteration*: five environments make a step and the recipe makes an update.
 
 """
-
-
-def roofline_of(case: str, products: dict[int, float]) -> float | None:
-    """FLOP/s of the matrix product with the rows of this case; None where there is none."""
-    if case.endswith("1 states x 1") or case.startswith("iteration"):
-        return None
-    rows = next((rows for text, rows in ROOFLINE_ROWS.items() if text in case), 1024)
-    return products.get(rows)
 
 
 def table(results: list[dict]) -> str:
@@ -45,7 +37,7 @@ def table(results: list[dict]) -> str:
     ]
     for info, seconds in rows:
         yardstick = seconds_of.get((info["case"], "yardstick"))
-        peak = roofline_of(info["case"], products)
+        peak = products.get(info.get("product_rows"))
         ratio = f"{yardstick / seconds:.2f}" if yardstick else ""
         share = f"{info['flops'] / seconds / peak:.0%}" if peak else ""
         if info["variant"] == "roofline":

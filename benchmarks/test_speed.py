@@ -20,6 +20,7 @@ from yardstick import PlainAgent
 
 SIZES = {"HalfCheetah": (17, 6), "Humanoid": (376, 17)}
 BATCH, WIDTH, NUM_STEPS = 256, 256, 20
+TILE_ROWS = 1024  # the actor's default
 VARIANTS = ("yardstick", "eager", "compiled")
 torch.set_num_threads(int(os.environ.get("THREADS", os.cpu_count() or 1)))
 
@@ -50,16 +51,30 @@ def make_batch(size: str) -> TensorDict:
     return random_batch(*SIZES[size], BATCH)
 
 
-def measure(benchmark, call, rows: int, case: str, variant: str, work: float) -> None:
-    """Times `call` after two warm-up rounds, which compile it where it is compiled."""
+def measure(
+    benchmark,
+    call,
+    rows: int,
+    case: str,
+    variant: str,
+    work: float,
+    tile_rows: int = TILE_ROWS,
+    comparable: bool = True,
+) -> None:
+    """Times `call` after two warm-up rounds, which compile it where it is compiled.
+
+    Its share of the roofline is of the product that has as many rows as are taken at once; there is
+    none where it is not `comparable` with that.
+    """
     threads = torch.get_num_threads()
     info = {"case": case, "variant": variant, "rows": rows, "flops": work, "threads": threads}
-    benchmark.extra_info.update(info)
+    product_rows = min(rows, tile_rows) if comparable else None
+    benchmark.extra_info.update(info, product_rows=product_rows)
     rounds = 3 if rows > 4096 else 10
     benchmark.pedantic(call, rounds=rounds, warmup_rounds=2, iterations=1)
 
 
-@pytest.mark.parametrize("rows", [32, 160, 1024])
+@pytest.mark.parametrize("rows", [32, 160, 256, 1024])
 def test_roofline(benchmark, rows):
     x, weight = torch.randn(2, rows, WIDTH), torch.randn(2, WIDTH, WIDTH)
     work = 20 * 2 * 2 * rows * WIDTH * WIDTH
@@ -144,6 +159,7 @@ def test_precision(benchmark, num_candidates, precision):
             case,
             "compiled",
             flops(rows, 6),
+            comparable=precision == "highest",
         )
     finally:
         torch.set_float32_matmul_precision("highest")
@@ -161,6 +177,7 @@ def test_tiles(benchmark, tile_rows):
         case,
         "compiled",
         flops(BATCH * 32, 6),
+        tile_rows=tile_rows,
     )
 
 

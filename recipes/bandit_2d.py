@@ -116,7 +116,9 @@ def ablate(cfg: BanditConfig, run_dir: Path) -> None:
 @hydra.main(version_base="1.3", config_path="configs", config_name="bandit_2d")
 def main(composed: DictConfig) -> None:
     """Runs the study or its ablation."""
-    wanted = OmegaConf.select(composed, "ablation.training")
+    wanted = any(
+        OmegaConf.select(composed, f"ablation.{part}") for part in ("training", "sampling")
+    )
     launch(composed, BanditConfig, "bandit_2d", ablate if wanted else study)
 
 

@@ -37,7 +37,7 @@ NORMAL_QUANTILE = 1.96  # of 95 %, both sides
 class EvaluateConfig(Section):
     """`evaluate.yaml`."""
 
-    run: str | list[str]
+    run: str | Annotated[list[str], Field(min_length=1)]
     checkpoint: int | str | None
     episodes: Annotated[int, Field(ge=2, le=10**4)]  # one has no standard error
     seed: Seed

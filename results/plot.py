@@ -1,6 +1,6 @@
 """Evaluation returns of several runs: one figure, and the same numbers as a table.
 
-    python results/plot.py results/quickstart/curve.png results/quickstart --line random=5
+    python results/plot.py OUT.png runs/one runs/another --line random=5
     python results/plot.py OUT.png runs/mine --x frames
 
 Runs that differ in nothing but their seed are one curve: the mean over seeds with a 95 % bootstrap

@@ -51,8 +51,17 @@ def test_the_guidance_weight_is_a_number_to_set_and_part_of_the_state():
     assert torch.equal(act(other, held, seed=0), act(actor, held, seed=0))
     other.guidance_weight = 0.0
     assert not torch.equal(act(other, held, seed=0), act(actor, held, seed=0))
-    with pytest.raises(ValueError, match="guidance_weight >= 0, got guidance_weight=-1"):
-        actor.guidance_weight = -1
+    for wrong in (-1, torch.tensor(-1.0)):
+        with pytest.raises(ValueError, match="guidance_weight >= 0, got guidance_weight=-1"):
+            actor.guidance_weight = wrong
+    actor.guidance_weight = torch.tensor(3.0)
+    assert actor.guidance_weight is buffer and buffer == 3 and buffer.dtype == torch.float64
+
+
+@pytest.mark.parametrize("name", ["in_keys", "out_keys"])
+def test_one_key_instead_of_a_list_is_told(name):
+    with pytest.raises(ValueError, match=f"Expected {name} as a list of keys, such as .'act'."):
+        make_actor(**{name: "act"})
 
 
 def test_casts_round_no_guidance_weight():

@@ -53,6 +53,16 @@ def test_exploration_noise_leaves_the_box_unless_the_action_is_clipped(box):
     torch.testing.assert_close(clipped, free.clamp(low, high))
 
 
+def test_a_clipped_action_is_within_the_bounds_to_the_last_bit():
+    low, high = torch.tensor([-2.0, -0.3, 0.1]), torch.tensor([0.4, 1.1, 0.7])
+    spec = Bounded(low, high, (3,))
+    actor = make_actor(spec=spec, exploration_noise=9.0, clip_action=True)
+    corners = actor.to_env(torch.tensor([[-1.0] * 3, [1.0] * 3]))
+    torch.testing.assert_close(corners, torch.stack([low, high]))
+    assert all(spec.is_in(corner) for corner in corners)
+    assert all(spec.is_in(action) for action in act(actor, observe(50)))
+
+
 def test_without_a_spec_both_units_are_the_same():
     actor, action = make_actor(), torch.randn(BATCH, ACTION)
     assert torch.equal(actor.to_env(action), action)

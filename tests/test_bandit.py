@@ -12,9 +12,10 @@ from omegaconf import OmegaConf
 from torchrl.envs.utils import check_env_specs
 
 import bandit_2d
+import bandit_beyond
 import recipe_cases
-from bandit import guided, rivals
-from bandit.config import BanditConfig, variants
+from bandit import guided, rivals, tables
+from bandit.config import BanditConfig, BeyondConfig, variants
 from bandit.env import TwoDBandit, mode_shares, reward
 from bandit.launch import begin
 from recipe_cases import rows_of
@@ -227,6 +228,55 @@ def test_ablation_has_a_row_for_each_combination(tmp_path):
     ]
 
 
+def test_an_ablation_is_the_same_on_several_processes(tmp_path):
+    changes = ["methods=[aca]", "seeds=[0,1]", "+ablation.training={data: [uniform, online]}"]
+    written = []
+    for num_workers in (1, 2):
+        folder = tmp_path / str(num_workers)
+        folder.mkdir()
+        cfg = composed(*TINY, *changes, f"num_workers={num_workers}")
+        bandit_2d.ablate(cfg, folder)
+        written.append(rows_of(folder / "ablation.csv"))
+    assert written[0] == written[1]
+    found = [(row["data"], row["seed"]) for row in written[0]]
+    assert found == [("uniform", "0"), ("uniform", "1"), ("online", "0"), ("online", "1")]
+    sums = [float(row["sum"]) for row in written[0]]
+    (uniform, online) = rows_of(folder / "ablation_table.csv")
+    assert float(uniform["ACA sum"]) == pytest.approx((sums[0] + sums[1]) / 2, abs=1e-3)
+    assert float(online["ACA sum"]) == pytest.approx((sums[2] + sums[3]) / 2, abs=1e-3)
+
+
+def test_a_table_has_the_means_over_seeds():
+    numbers = dict.fromkeys(tables.NUMBERS, 0.5)
+    runs = [
+        {"method": "aca", "weight": weight, **numbers, "sum": total}
+        for weight, total in ((10.0, 0.2), (40.0, 0.4))
+    ]
+    mean, paper = tables.summary(runs)
+    assert (mean["method"], mean["source"], mean["sum"]) == ("ACA", "here, 2 seeds", "0.300")
+    assert (mean["lowest_sum"], mean["highest_sum"], mean["w"]) == ("0.200", "0.400", "10 40")
+    assert (paper["source"], paper["sum"]) == ("paper", "0.993")
+
+
+def test_the_study_beyond_tells_the_automatic_weight_from_the_sweeps_best(tmp_path):
+    composed = recipe_cases.composed(*TINY, name="bandit_beyond")
+    settings = OmegaConf.to_container(composed)
+    training = {"beyond.reward_scale": [1.0, 10.0], "collector.guidance_weight.aca": [5.0]}
+    settings["ablation"]["training"] = training
+    cfg = checked(BeyondConfig, settings)
+    bandit_beyond.study(cfg, tmp_path)
+    guidance = rows_of(tmp_path / "guidance.csv")
+    assert [row["beyond.reward_scale"] for row in guidance] == ["1.0", "10.0"]
+    for row in guidance:
+        assert float(row["best w"]) in (10, 40) and float(row["auto w"]) not in (5, 10, 40)
+    soft = rows_of(tmp_path / "soft.csv")  # of the first combination, where no reward exceeds 1
+    assert [float(row["tau"]) for row in soft] == cfg.beyond.temperatures
+    for name in ("critic", "reward", "reward, all candidates at once"):
+        values = [float(row[name]) for row in soft]
+        assert values == sorted(values, reverse=True)  # from the largest value to the mean
+    assert all(0 <= float(row["reward"]) <= 1 for row in soft)
+
+
 def test_the_ablation_has_a_configuration_for_each_training():
     cfg = composed(name="bandit_2d_ablation")
     made = variants(cfg)
@@ -262,6 +312,8 @@ def test_studies_of_the_same_second_never_share_a_directory(tmp_path, monkeypatc
         ("+rivals.sdac.chosen.num_proposals=9", "rivals.sdac.chosen={'inverse_temperature': "),
         ("methods=[]", "methods=[]: expected"),
         ("seeds=[]", "seeds=[]: expected"),
+        ("seeds=[0,1,0]", "seeds=[0, 1, 0]: expected each of them once"),
+        ("methods=[aca,aca]", "methods=['aca', 'aca']: expected each of them once"),
         ("seeds=0", "seeds=0: expected a valid list"),
         ("collector.frames=30001", "collector.frames=30001: expected a multiple of"),
         ("collector.frames_per_batch=0", "collector.frames_per_batch=0: expected greater than"),
@@ -287,6 +339,28 @@ def test_studies_of_the_same_second_never_share_a_directory(tmp_path, monkeypatc
 def test_wrong_settings_are_told_before_any_work(override, message):
     with pytest.raises(RunError, match=re.escape(message)):
         variants(composed(override))
+
+
+@pytest.mark.parametrize(
+    ("name", "override", "message"),
+    [
+        ("bandit_2d_ablation", "methods=[aca,dacer]", "guided samplers alone, without .'dacer'"),
+        ("bandit_2d_ablation", "methods=[aca,nclql]", "no 'nclql', which does not see the chain"),
+        ("bandit_beyond", "methods=[langevin_q]", "methods.0='langevin_q': expected 'aca'"),
+    ],
+)
+def test_methods_that_a_study_cannot_compare_are_refused(name, override, message):
+    schema = BeyondConfig if name == "bandit_beyond" else BanditConfig
+    with pytest.raises(RunError, match=message):
+        checked(schema, recipe_cases.composed(override, name=name))
+
+
+def test_samplings_alone_are_an_ablation(tmp_path):
+    typed = [*TINY, "methods=[aca]", "+ablation.sampling.normalize_gradient=[true,false]"]
+    code, _, errors = recipe_cases.run(*typed, "run_dir=run", cwd=tmp_path, recipe="bandit_2d")
+    assert code == 0, errors
+    rows = rows_of(tmp_path / "run" / "ablation.csv")
+    assert [row["normalize_gradient"] for row in rows] == ["True", "False"]
 
 
 def test_a_mistake_ends_in_one_message_and_leaves_nothing(tmp_path):

@@ -6,10 +6,12 @@ import re
 
 import pytest
 import torch
+from torchrl.objectives import SoftUpdate
 
 import gpu
+from recipe import random_batch
 from report import loop_overhead, table
-from torchrl_aca import CriticGuidedDenoisingActor, NoiseLevelCritic, NoiseSchedule
+from torchrl_aca import ACALoss, CriticGuidedDenoisingActor, NoiseLevelCritic, NoiseSchedule
 from torchrl_aca.interop import load_official
 from yardstick import PlainAgent
 
@@ -43,14 +45,56 @@ def test_the_yardstick_samples_what_the_actor_samples(monkeypatch):
     torch.testing.assert_close(action, expected, rtol=0, atol=1e-4)
 
 
+def test_the_yardstick_updates_as_the_loss_does(monkeypatch):
+    plain = PlainAgent(7, 2, 4)
+    plain.critics.double(), plain.targets.double()
+    critic = NoiseLevelCritic(7, 2, num_steps=4, dtype=torch.float64)
+    load_official(critic, *map(official, plain.critics))
+    loss = ACALoss(CriticGuidedDenoisingActor(critic, NoiseSchedule.cosine(4)))
+    loss.make_value_estimator(gamma=0.99)
+    updater = SoftUpdate(loss, tau=0.005)
+    optimizer = torch.optim.Adam(critic.parameters(), lr=1e-3)
+    batch = random_batch(7, 2, 8).apply(lambda x: x.double() if x.is_floating_point() else x)
+    batch["next", "terminated"][:3] = True
+    action, noise = torch.randn(2, 8, 2, dtype=torch.float64)
+    draws = {"next_action": action, "noise": noise, "noise_level": torch.randint(1, 5, (8,))}
+    monkeypatch.setattr(plain, "sample", lambda observation, num: action)
+    monkeypatch.setattr(torch, "randint", lambda *_: draws["noise_level"])
+    monkeypatch.setattr(torch, "randn_like", lambda like: noise)
+    for _ in range(3):
+        plain.update(batch, 1)
+        data = batch.copy().update(draws)
+        for name in ("qvalue", "noise_level"):
+            getattr(loss, f"{name}_loss")(data)[f"loss_{name}"].backward()
+            optimizer.step()
+            optimizer.zero_grad()
+        updater.step()
+    expected = NoiseLevelCritic(7, 2, num_steps=4, dtype=torch.float64)
+    for params, networks in (
+        (critic.state_dict(), plain.critics),
+        (targets_of(loss), plain.targets),
+    ):
+        load_official(expected, *map(official, networks))
+        for name, value in expected.state_dict().items():
+            torch.testing.assert_close(params[name], value, rtol=0, atol=1e-7)
+
+
+def targets_of(loss) -> dict[str, torch.Tensor]:
+    params = loss.target_qvalue_network_params.flatten_keys(".")
+    return {name: params[name] for name in params}
+
+
 def test_the_report_divides_by_yardstick_and_roofline():
     def result(case, variant, rows, flops, seconds):
         info = {"case": case, "variant": variant, "rows": rows, "flops": flops}
-        return {"extra_info": info, "stats": {"median": seconds}}
+        return {"extra_info": {**info, "product_rows": rows}, "stats": {"median": seconds}}
 
     text = table(
         [
             result("product", "roofline", 1024, 100e9, 1.0),  # 100 GFLOP/s
+            result("small product", "roofline", 256, 50e9, 1.0),  # 50 GFLOP/s
+            result("small chain", "compiled", 256, 40e9, 1.0),
+            result("other chain", "compiled", 512, 40e9, 1.0),
             result("chain", "yardstick", 1024, 200e9, 8.0),  # 25 GFLOP/s
             result("chain", "compiled", 1024, 200e9, 2.5),  # 80 GFLOP/s
         ]
@@ -60,6 +104,8 @@ def test_the_report_divides_by_yardstick_and_roofline():
     )
     assert "| product | roofline | 1000.0 ms |  | 100 GFLOP/s |" in text
     assert "| chain | yardstick | 8000.0 ms | 1.00 | 25% |" in text
+    assert "| small chain | compiled | 1000.0 ms |  | 80% |" in text
+    assert "| other chain | compiled | 1000.0 ms |  |  |" in text  # nothing to compare with
     assert "| chain | compiled | 2500.0 ms | 3.20 | 80% |" in text
 
 
@@ -77,16 +123,34 @@ def test_the_report_tells_what_the_loop_costs():
 def test_the_gpu_command_times_what_works_and_tells_what_does_not(tmp_path, monkeypatch):
     torch.set_num_threads(1)
     arguments = ["--device", "cpu", "--no-tests", "--updates", "0", "--seconds", "0.1"]
-    cases = ["--tasks", "inverted_pendulum", "--candidates", "1", "--variants", "eager", "broken"]
+    cases = [
+        "--tasks",
+        "inverted_pendulum",
+        "--candidates",
+        "1",
+        "--variants",
+        "eager",
+        "broken",
+        "silent",
+    ]
     monkeypatch.setitem(gpu.VARIANTS, "broken", ["device=nonsense"])
+    monkeypatch.setitem(gpu.VARIANTS, "silent", [])
+    measure = gpu.measure
+
+    def measure_or_fail(case, *how):
+        assert case.variant != "silent"
+        return measure(case, *how)
+
+    monkeypatch.setattr(gpu, "measure", measure_or_fail)
     assert gpu.main([*arguments, *cases, "--out", str(tmp_path)]) == 0
-    *_, works, fails = (tmp_path / "speed.md").read_text().splitlines()
+    *_, works, fails, silent = (tmp_path / "speed.md").read_text().splitlines()
     assert re.fullmatch(
         r"\| inverted_pendulum \| 1 \| eager \| \d+\.\d\d ms \| \d+\.\d\d ms \| \d+ \|", works
     )
     assert fails.startswith(
         "| inverted_pendulum | 1 | broken | failed: RunError: device='nonsense'"
     )
+    assert silent.startswith("| inverted_pendulum | 1 | silent | failed: AssertionError: ")
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU would be used")

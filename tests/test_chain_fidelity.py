@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -51,6 +53,39 @@ def test_shares_at_the_border_by_hand():
     path = idle.trajectory(states, torch.randn(5, 6, 5, 2))
     beyond = [(path[4 - k].abs() > schedule.alphas_cumprod[k - 1].sqrt()) for k in (1, 2, 3, 4)]
     assert shares == pytest.approx([float(b.double().mean()) for b in beyond])
+
+
+def test_the_measures_of_a_chain_by_hand(monkeypatch):
+    """The critic's value is the action itself, in one dimension."""
+    monkeypatch.setattr(chain_fidelity, "PERMUTATIONS", 199)
+    critic = SimpleNamespace(evaluate=lambda features, actions, level: actions)
+    actor = SimpleNamespace(encode=lambda states, batch: None, critic=critic)
+    states = torch.zeros(1, 3), torch.zeros(2, 3)
+    drawn = torch.randn(2, 60, 2, 1, generator=torch.Generator().manual_seed(0))
+    moved = torch.stack([drawn[1, :, 0], drawn[1, :, 1] + 3], 1)  # in the second state alone
+    reference = torch.tensor([0.0, 2.0]).reshape(2, 1, 1), drawn[0]
+    samples = torch.tensor([1.0, 5.0]).reshape(2, 1, 1), moved
+    found = chain_fidelity.compare(actor, states, reference, samples)
+    root = 2**0.5  # the standard deviation of 0 and 2
+    expected = {
+        "value": 3.0,
+        "value_spread": root,
+        "value_difference": (3 - 1) / root,
+        "std": 2 * root,
+        "std_ratio": 2.0,
+        "rejected": 0.5,
+    }
+    assert {name: found[name] for name in expected} == pytest.approx(expected)
+    assert found["energy_distance"] > 0.5
+
+
+@pytest.mark.parametrize("raw", [False, True])
+def test_a_chain_has_the_gradients_that_are_asked_for(raw):
+    critic, schedule = NoiseLevelCritic(3, 2, num_steps=4), NoiseSchedule.cosine(4)
+    actor = CriticGuidedDenoisingActor(critic, schedule, guidance_weight=7.0)
+    made = chain_fidelity._Chain(actor, [1, 2, 4], SimpleNamespace(raw_gradient=raw)).actor
+    assert (made.normalize_gradient, float(made.guidance_weight)) == (not raw, 7.0)
+    assert made.inference_levels == [1, 2, 4]
 
 
 def test_the_newest_states_of_a_full_buffer_and_of_a_mixture():

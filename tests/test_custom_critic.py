@@ -347,3 +347,32 @@ def test_only_modules_become_critics():
 def test_the_actor_asks_for_the_action_dimension_that_a_custom_critic_does_not_tell():
     with pytest.raises(ValueError, match="Pass spec= or action_dim="):
         make_actor(Network(), action_dim=None)
+
+
+def test_towers_in_one_sequence_with_keys_of_the_same_name_stay_apart():
+    def tower(out_key):
+        body = TensorDictModule(nn.Linear(3, 4), in_keys=["observation"], out_keys=["hidden"])
+        value = nn.Linear(4 + 2, 1)
+        head = TensorDictModule(
+            lambda hidden, action, value=value: value(torch.cat([hidden, action], -1)),
+            in_keys=["hidden", "action"],
+            out_keys=[out_key],
+        )
+        return body, head
+
+    join = TensorDictModule(
+        lambda *values: torch.cat(values, -1), in_keys=["q1", "q2"], out_keys=["state_action_value"]
+    )
+    module = TensorDictSequential(*tower("q1"), *tower("q2"), join)
+    critic = CustomCritic(module)
+    observation, action = torch.randn(5, 3), torch.randn(5, 2)
+    expected = module(TensorDict(observation=observation, action=action, batch_size=[5]))
+    values = critic.evaluate(critic.encode(observation), action, torch.zeros(5, dtype=torch.long))
+    torch.testing.assert_close(values, expected["state_action_value"])
+    values.sum().backward()
+    assert all(parameter.grad is not None for parameter in module.parameters())
+
+
+def test_one_key_instead_of_a_list_is_told():
+    with pytest.raises(ValueError, match=r"observation_keys as a list of keys, such as .'pixels'."):
+        CustomCritic(nn.Linear(3, 1), observation_keys="pixels")

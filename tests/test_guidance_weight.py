@@ -228,3 +228,22 @@ def test_a_fixed_weight_stays_and_what_auto_needs_is_told():
         ACALoss(make_actor(guidance_weight=0.0), guidance_weight="auto")
     with pytest.raises(ValueError, match="Expected guidance_weight to be one of"):
         make_loss(guidance_weight="automatic")
+
+
+def test_nan_in_a_terminal_state_moves_no_weight():
+    loss = make_loss(guidance_weight="auto", num_target_candidates=4)
+    data, weights = make_data(6), []
+    data["next", "terminated"][2] = data["next", "done"][2] = True
+    for value in (float("nan"), 0.0):
+        data["next", "observation"][2] = value
+        other = copy.deepcopy(loss)
+        torch.manual_seed(0)
+        assert other.qvalue_loss(data)["loss_qvalue"].isfinite()
+        if value == 0.0:  # what is left out is this state
+            keys = other.tensor_keys
+            for key in (keys.candidate_spread, keys.guidance_gain):
+                data[key] = data[key].masked_fill(data["next", "terminated"].squeeze(-1), torch.nan)
+        other.step_guidance_weight(data)
+        weights.append(other.actor_network.guidance_weight.item())
+    assert math.isfinite(weights[0])
+    assert weights[0] == pytest.approx(weights[1], rel=0.02)  # but for its part in the scale

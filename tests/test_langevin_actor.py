@@ -96,3 +96,11 @@ def test_its_noisy_levels_learn_the_mean_of_the_target_critics():
     error = loss.noise_level_loss(make_data(4))["loss_noise_level"]
     # Both online critics regress on the targets' mean, 4.
     torch.testing.assert_close(error, torch.full((4,), 32.0))
+
+
+@pytest.mark.parametrize("keyword", ["sampler", "langevin_step_size"])
+def test_keywords_of_other_chains_are_refused(keyword):
+    with pytest.raises(ValueError, match=f"have no .'{keyword}'.: expected steps_per_level"):
+        AnnealedLangevinActor(
+            NoiseLevelCritic(3, 2, num_steps=9), VarianceExplodingSchedule(9), **{keyword: None}
+        )

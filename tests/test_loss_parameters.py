@@ -102,3 +102,17 @@ def test_hard_update_copies_the_parameters_once_its_interval_has_passed():
     torch.testing.assert_close(
         loss.target_qvalue_network_params.data, loss.qvalue_network_params.data
     )
+
+
+def test_a_state_dict_that_is_assigned_keeps_actor_and_loss_together():
+    loss, other = make_loss(guidance_weight="auto"), make_loss(guidance_weight="auto")
+    other.log_alpha.data.fill_(0.3)
+    other.actor_network.guidance_weight = 8
+    loss.load_state_dict(other.state_dict(), assign=True)
+    actor = loss.actor_network
+    assert actor.log_alpha is loss.log_alpha and actor.log_alpha.item() == pytest.approx(0.3)
+    assert actor.guidance_weight is loss.guidance_weight and actor.guidance_weight == 8
+    for name, value in actor.critic.state_dict().items():
+        assert torch.equal(value, other.actor_network.critic.state_dict()[name])
+    networks = zip(actor.critic.parameters(), loss.qvalue_network_params.parameters(), strict=True)
+    assert all(held is trained for held, trained in networks)

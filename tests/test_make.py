@@ -7,7 +7,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase, GymEnv
+from torchrl.envs import EnvBase, GymEnv, RenameTransform, TransformedEnv
 
 from torchrl_aca import (
     ACALoss,
@@ -142,3 +142,19 @@ def test_a_wrong_observation_dim_or_number_of_keys_is_told():
     data = TensorDict(a=torch.zeros(2, 4), b=torch.zeros(2, 1), batch_size=[2])
     with pytest.raises(ValueError, match=r"got observations of 4 \+ 1 numbers"):
         two(data)
+
+
+@pytest.mark.parametrize("key", ["act", ("agents", "act")])
+def test_the_action_may_have_another_key(key):
+    env = TransformedEnv(TwoVectors(), RenameTransform([], [], ["action"], [key]))
+    keys = ["position", ("robot", "velocity")]
+    aca = make_aca(env, observation_keys=keys, **SMALL)
+    assert aca.actor.out_keys == [key]
+    data = env.rollout(4, aca.actor)
+    assert data[key].shape == (4, 2)
+    assert aca.loss(data)["loss_qvalue"].isfinite()
+
+
+def test_an_action_that_is_no_vector_is_told():
+    with pytest.raises(ValueError, match="bounded, continuous action spec"):
+        make_aca(GymEnv("CartPole-v1", categorical_action_encoding=True))

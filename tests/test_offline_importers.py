@@ -223,7 +223,7 @@ def test_damage_that_shows_up_in_the_middle_leaves_nothing(source, tmp_path, mon
 @pytest.mark.parametrize("damage", range(40))
 def test_damage_anywhere_is_told_in_one_message(source, tmp_path, damage):
     content = bytearray(source.read_bytes())
-    start = 60 * damage
+    start = damage * (len(content) - 24) // 39  # the first byte to the last
     content[start : start + 24] = bytes(24)
     source.write_bytes(content)
     try:

@@ -171,10 +171,10 @@ class CriticGuidedDenoisingActor(ChainPolicy):
         self.register_buffer("guidance_weight", weight)
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """A number given to ``guidance_weight`` fills the buffer, whoever else may hold it."""
-        if name == "guidance_weight" and not isinstance(value, Tensor):
-            check_at_least(0, guidance_weight=value)
-            self.guidance_weight.fill_(value)
+        """A weight given to ``guidance_weight`` fills the buffer, whoever else may hold it."""
+        if name == "guidance_weight":
+            check_at_least(0, guidance_weight=float(value))
+            self.guidance_weight.fill_(float(value))
         else:
             super().__setattr__(name, value)
 
@@ -182,7 +182,7 @@ class CriticGuidedDenoisingActor(ChainPolicy):
         """The guidance weight follows device moves, not casts: as a float, it is float64."""
         weight = self.guidance_weight
         super()._apply(fn, recurse)
-        self.guidance_weight = weight.to(self.guidance_weight.device)
+        self._buffers["guidance_weight"] = weight.to(self.guidance_weight.device)
         return self
 
     # --- the candidates ---------------------------------------------------------------------------

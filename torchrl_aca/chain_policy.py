@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
 
 from torchrl_aca import chain
-from torchrl_aca.checks import action_spec, check_above, check_at_least, check_choice
+from torchrl_aca.checks import action_spec, check_above, check_at_least, check_choice, check_keys
 
 __all__ = ["ChainPolicy"]
 
@@ -26,6 +26,8 @@ class ChainPolicy(TensorDictModuleBase):
     of standard deviation ``exploration_noise * alpha``; ``log_alpha`` is a parameter.
     """
 
+    low: Tensor
+    high: Tensor
     center: Tensor
     half_range: Tensor
     fixed_noise: Tensor
@@ -56,6 +58,7 @@ class ChainPolicy(TensorDictModuleBase):
         check_at_least(0, exploration_noise=exploration_noise)
         check_above(0, alpha_init=alpha_init)
         check_choice(("fixed", "fresh"), deterministic_draws=deterministic_draws)
+        check_keys(in_keys=in_keys, out_keys=out_keys)
         self.num_candidates = num_candidates
         self.exploration_noise = exploration_noise
         self.deterministic_draws = deterministic_draws
@@ -70,7 +73,7 @@ class ChainPolicy(TensorDictModuleBase):
     def _fix_noise(self, like: Tensor, num_steps: int) -> None:
         """The draws of deterministic calls, for a chain of so many steps."""
         shape = (num_steps + 1, self.num_candidates, self.action_dim)
-        noise = torch.randn(shape, generator=torch.Generator().manual_seed(0))
+        noise = torch.randn(shape, generator=torch.Generator().manual_seed(0), device="cpu")
         self.register_buffer("fixed_noise", noise.to(like), persistent=False)
 
     def _set_spec(self, like: Tensor, spec: TensorSpec | None, action_dim: int | None) -> None:
@@ -80,12 +83,14 @@ class ChainPolicy(TensorDictModuleBase):
         low, high = torch.full(leaf.shape, -1.0), torch.full(leaf.shape, 1.0)
         if spec is not None:
             low, high = leaf.space.low, leaf.space.high
-        self.register_buffer("center", ((high + low) / 2).to(like), persistent=False)
-        self.register_buffer("half_range", ((high - low) / 2).to(like), persistent=False)
+        bounds = {"low": low, "high": high, "center": (high + low) / 2}
+        for name, value in {**bounds, "half_range": (high - low) / 2}.items():
+            self.register_buffer(name, value.to(like), persistent=False)
 
     def to_env(self, action: Tensor) -> Tensor:
-        """[-1, 1] to the env's units."""
-        return self.center + self.half_range * action
+        """[-1, 1] to the env's units; what ``clip_action`` has clipped stays within the bounds."""
+        action = self.center + self.half_range * action
+        return action.clamp(self.low, self.high) if self.clip_action else action  # of the rounding
 
     def from_env(self, action: Tensor) -> Tensor:
         """The env's units to [-1, 1]."""

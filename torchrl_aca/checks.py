@@ -9,7 +9,14 @@ from tensordict.utils import NestedKey
 from torch import nn
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 
-__all__ = ["action_spec", "check_above", "check_at_least", "check_choice", "first_parameter"]
+__all__ = [
+    "action_spec",
+    "check_above",
+    "check_at_least",
+    "check_choice",
+    "check_keys",
+    "first_parameter",
+]
 
 
 def check_at_least(least: int, **numbers: float) -> None:
@@ -31,6 +38,13 @@ def check_choice(choices: Sequence[str], **values: str) -> None:
     for name, value in values.items():
         if value not in choices:
             raise ValueError(f"Expected {name} to be one of {tuple(choices)}, got {value!r}.")
+
+
+def check_keys(**keys: Sequence[NestedKey] | None) -> None:
+    """Raise a ValueError for a string where a list of keys is expected: it would be its letters."""
+    for name, value in keys.items():
+        if isinstance(value, str):
+            raise ValueError(f"Expected {name} as a list of keys, such as [{value!r}], got a str.")
 
 
 def first_parameter(network: nn.Module) -> nn.Parameter:

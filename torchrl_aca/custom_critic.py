@@ -10,6 +10,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequ
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
+from torchrl_aca.checks import check_keys
 from torchrl_aca.critic import NoiseLevelCriticBase
 
 __all__ = ["CustomCritic", "as_noise_level_critic"]
@@ -44,7 +45,8 @@ class CustomCritic(NoiseLevelCriticBase):
         first_level: see :class:`NoiseLevelCriticBase`.
 
     Raises:
-        ValueError: if the module does not read the action or does not write the value.
+        ValueError: if the module does not read the action or does not write the value, or
+            ``observation_keys`` is one key instead of a list.
     """
 
     def __init__(
@@ -57,6 +59,7 @@ class CustomCritic(NoiseLevelCriticBase):
         value_key: NestedKey = "state_action_value",
         first_level: int = 1,
     ) -> None:
+        check_keys(observation_keys=observation_keys)
         row_keys = (action_key, noise_level_key)
         if isinstance(module, TensorDictModuleBase):
             inner = module
@@ -120,10 +123,15 @@ def _split(
         else [module]
     )
     encoder, head = [], []
+    used = set(
+        row_keys
+    )  # what the head reads or writes: a part in front of it must not change that
     for part in parts:
-        if row_keys.isdisjoint(cast("list[NestedKey]", part.in_keys)):
+        reads, writes = (cast("list[NestedKey]", keys) for keys in (part.in_keys, part.out_keys))
+        if row_keys.isdisjoint(reads) and used.isdisjoint(writes):
             encoder.append(part)
         else:
             head.append(part)
-            row_keys = row_keys.union(cast("list[NestedKey]", part.out_keys))
+            row_keys = row_keys.union(writes)
+            used.update(reads, writes)
     return TensorDictSequential(*encoder), TensorDictSequential(*head)

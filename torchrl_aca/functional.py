@@ -219,7 +219,8 @@ def guidance_gain(values: Tensor, log_ratio: float) -> Tensor:
 
     Args:
         values: critic values at level 0 of shape ``(N, *batch, E)``; the second half of the ``N``
-            comes from chains with a guidance weight ``exp(log_ratio)`` times smaller.
+            comes from chains with a guidance weight ``exp(log_ratio)`` times smaller. States with
+            NaN, as terminal ones may have, have a gain of NaN and no part in the scale.
         log_ratio: see ``values``.
 
     Returns:
@@ -227,7 +228,7 @@ def guidance_gain(values: Tensor, log_ratio: float) -> Tensor:
     """
     lowest = values.amin(-1)
     more, less = lowest.tensor_split(2)
-    scale = lowest.var(0).mean().sqrt()
+    scale = lowest.var(0).nanmean().sqrt()
     return (more.mean(0) - less.mean(0)) / (log_ratio * scale + torch.finfo(scale.dtype).tiny)
 
 

@@ -20,6 +20,9 @@ from torchrl_aca.schedule import VarianceExplodingSchedule
 __all__ = ["AnnealedLangevinActor", "make_nclql_actor"]
 
 
+OTHER_CHAINS = {"sampler", "langevin_step_size"}  # keywords of the parent that do nothing here
+
+
 class AnnealedLangevinActor(CriticGuidedDenoisingActor):
     """Samples actions as NC-LQL does (arXiv 2602.07873); all else is ACA's actor.
 
@@ -43,7 +46,7 @@ class AnnealedLangevinActor(CriticGuidedDenoisingActor):
             ``clip_denoised`` clips the action after each step.
 
     Raises:
-        ValueError: as :class:`CriticGuidedDenoisingActor`.
+        ValueError: as :class:`CriticGuidedDenoisingActor`, and for keywords of its other chains.
 
     Examples:
         >>> from torchrl_aca.langevin_actor import AnnealedLangevinActor
@@ -72,6 +75,11 @@ class AnnealedLangevinActor(CriticGuidedDenoisingActor):
     ) -> None:
         check_at_least(1, steps_per_level=steps_per_level)
         check_above(0, step_size=step_size)
+        if other := sorted(OTHER_CHAINS & kwargs.keys()):
+            raise ValueError(
+                f"Annealed Langevin dynamics have no {other}: expected steps_per_level and "
+                "step_size in their place."
+            )
         super().__init__(
             critic,
             schedule,

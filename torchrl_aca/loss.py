@@ -36,7 +36,8 @@ class ACALoss(OpenLoopAlpha, AutoGuidance, TDLoss):
       over the noisy levels, where the target is made of ``Q(s, a_0, 0)``;
     - :meth:`alpha_loss`: ``log_alpha * stop_grad(H(alpha) - H_target)``.
 
-    :meth:`forward` gives all three, as the paper's summed objective. The official code instead
+    :meth:`forward` gives all three, as the paper's summed objective (whose second loss has
+    ``noise_level_target="self"``). The official code instead
     takes an optimiser step on the first, and at every second update another on the second,
     computed after the first step: call the methods one by one for that.
 
@@ -345,6 +346,10 @@ class ACALoss(OpenLoopAlpha, AutoGuidance, TDLoss):
         super()._tie()
         self._tie_alpha()
         self._tie_guidance()
+
+    def _take_loaded(self) -> None:
+        self._take_loaded_guidance()
+        super()._take_loaded()
 
     def _apply(self, fn: Callable) -> ACALoss:
         """Take the actor along."""

@@ -9,12 +9,12 @@ from typing import Any
 import torch
 from tensordict.utils import NestedKey
 from torch.optim import Adam, Optimizer
-from torchrl.data import Bounded
+from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 from torchrl.objectives import SoftUpdate
 
 from torchrl_aca.actor import CriticGuidedDenoisingActor
-from torchrl_aca.checks import check_choice
+from torchrl_aca.checks import action_spec, check_choice
 from torchrl_aca.critic import NoiseLevelCritic
 from torchrl_aca.loss import ACALoss
 from torchrl_aca.schedule import NoiseSchedule
@@ -24,7 +24,7 @@ __all__ = ["ACAParts", "make_aca", "make_aca_actor"]
 
 def make_aca_actor(
     observation_dim: int,
-    spec: Bounded,
+    spec: TensorSpec,
     *,
     num_steps: int = 20,
     schedule: str = "cosine",
@@ -39,7 +39,8 @@ def make_aca_actor(
 
     Args:
         observation_dim: size ``O`` of the observation vector, or of all of them together.
-        spec: bounded spec of one env's action, of shape ``(A,)``.
+        spec: bounded spec of one env's action, of shape ``(A,)``, or a ``Composite`` that holds it
+            under the action's key.
 
     Keyword Args:
         num_steps: number ``T`` of noise levels. Default: 20.
@@ -62,9 +63,10 @@ def make_aca_actor(
         torch.Size([3, 6])
     """
     check_choice(("cosine", "linear", "vp"), schedule=schedule)
+    action_dim = action_spec(spec, actor.get("out_keys", ["action"])[0], None).shape[-1]
     critic = NoiseLevelCritic(
         observation_dim,
-        spec.shape[-1],
+        action_dim,
         num_steps=num_steps,
         num_critics=num_critics,
         num_cells=num_cells,
@@ -127,7 +129,8 @@ def make_aca(
         alpha_lr: learning rate of ``log_alpha``. Default: 3e-2.
         make_optimizer: called as ``make_optimizer(parameters, lr=...)``. Default: Adam.
         device: device of the parameters. Default: the environment's.
-        actor: other keywords of :func:`make_aca_actor` and of the actor.
+        actor: other keywords of :func:`make_aca_actor` and of the actor; ``out_keys`` is by default
+            the environment's action key.
 
     Raises:
         ValueError: if ``env`` has no such observations or no bounded vector as action, or one of
@@ -151,7 +154,7 @@ def make_aca(
         env.action_spec_unbatched,
         observation_keys=observation_keys,
         device=device,
-        **actor,
+        **{"out_keys": env.action_keys[:1], **actor},
     )
     module = ACALoss(network, num_target_candidates=num_target_candidates, **(loss or {}))
     module.make_value_estimator(gamma=gamma)

@@ -47,6 +47,7 @@ class TDLoss(LossModule):
         self._in_keys: list[NestedKey] | None = None
         self._out_keys: list[str] | None = None
         super().__init__()
+        self.register_load_state_dict_post_hook(_tie_loaded)
 
     @abstractmethod
     def _state_keys(self) -> list[NestedKey]:
@@ -148,6 +149,10 @@ class TDLoss(LossModule):
         """Give ``qvalue_network`` the loss's parameters and buffers."""
         self.qvalue_network_params.to_module(self.qvalue_network)
 
+    def _take_loaded(self) -> None:
+        """Bring what a state dict has put into the loss to the parts that hold the same."""
+        self._tie()
+
     def __deepcopy__(self, memo: dict[int, Any]) -> Any:
         """A copy of its own whose parts hold the same parameters."""
         clone = self.__class__.__new__(self.__class__)
@@ -191,6 +196,11 @@ class TDLoss(LossModule):
     @out_keys.setter
     def out_keys(self, values: list[str]) -> None:
         self._out_keys = values
+
+
+def _tie_loaded(loss: TDLoss, incompatible_keys: Any) -> None:
+    """With ``assign=True`` the tensors of a state dict take the place of those that were tied."""
+    loss._take_loaded()
 
 
 def next_key(key: NestedKey) -> NestedKey:

@@ -110,6 +110,10 @@ class AutoGuidance:
         """Take the actor's buffer, whatever has become of it."""
         self.guidance_weight = self.actor_network.guidance_weight
 
+    def _take_loaded_guidance(self) -> None:
+        """Give the actor the weight that a state dict has put into the loss."""
+        self.actor_network.guidance_weight.copy_(self.guidance_weight)
+
     def _candidates(self, features: Any, noise: Tensor) -> Tensor:
         """The target's candidates ``(N, B, A)``; to tune ``w``, from a little above and below."""
         actor = self.actor_network
@@ -144,8 +148,9 @@ class AutoGuidance:
             KeyError: if they have not written it.
         """
         keys = self.tensor_keys
-        spread = tensordict[keys.candidate_spread].square().mean().sqrt()
-        gain = tensordict[keys.guidance_gain].mean()
+        # Terminal states may hold NaN, which no other loss sees either.
+        spread = tensordict[keys.candidate_spread].square().nanmean().sqrt()
+        gain = tensordict[keys.guidance_gain].nanmean()
         step = self.guidance_weight_lr * F.guidance_step(spread, self.target_spread, gain)
         # In place: actor, loss and whoever else holds the weight see the new one.
         self.guidance_weight.mul_(step.exp())

@@ -86,7 +86,8 @@ class ACASettings(Section):
             expected = f"rising integers from 1 to aca.num_steps ({self.num_steps}), both included"
             self.refuse("inference_levels", expected)
         if self.num_inference_steps not in (self.num_steps, len(levels)):
-            self.refuse("num_inference_steps", "left out beside aca.inference_levels")
+            number = f"{len(levels)}, the number of aca.inference_levels"
+            self.refuse("num_inference_steps", f"aca.num_steps ({self.num_steps}) or {number}")
 
 
 class ACAOptim(DecayOptim):

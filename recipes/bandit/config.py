@@ -57,6 +57,10 @@ class Ablation(Section):
     training: dict[str, Annotated[list[Any], Field(min_length=1)]]
     sampling: Sampling
 
+    def wanted(self) -> bool:
+        """Whether there is anything to combine."""
+        return bool(self.training or self.sampling.model_fields_set)
+
     def samplings(self) -> list[Row]:
         """Every combination of the actor's settings."""
         return combinations(self.sampling.model_dump(exclude_unset=True))
@@ -168,6 +172,28 @@ class BanditConfig(Section):
             self.refuse("rivals", f"settings of {sorted(missing)} as well")
         return self
 
+    @model_validator(mode="after")
+    def _each_once(self) -> BanditConfig:
+        for name in ("methods", "seeds"):
+            values = getattr(self, name)
+            if len(set(values)) < len(values):
+                self.refuse(name, "each of them once")
+        return self
+
+    @model_validator(mode="after")
+    def _ablation_fits(self) -> BanditConfig:
+        if not self.ablation.wanted():
+            return self
+        if rivals := set(self.methods) & set(RIVALS):
+            self.refuse(
+                "methods", f"an ablation of guided samplers alone, without {sorted(rivals)}"
+            )
+        if "nclql" in self.methods and "chain.schedule" in self.ablation.training:
+            self.refuse(
+                "methods", "no 'nclql', which does not see the chain.schedule of the ablation"
+            )
+        return self
+
 
 class Beyond(Section):
     """What `bandit_beyond.yaml` adds."""
@@ -184,6 +210,7 @@ class Beyond(Section):
 class BeyondConfig(BanditConfig):
     """`bandit_beyond.yaml`."""
 
+    methods: Annotated[list[Literal["aca"]], Field(min_length=1)]
     beyond: Beyond
 
 

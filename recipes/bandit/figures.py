@@ -225,11 +225,12 @@ def animate(paths: Mapping[str, Tensor], file: Path) -> None:
             ax.scatter(*path[0].T, s=7, color="#FFE119", edgecolors="black", linewidths=0.3)
         )
     last = max(map(len, paths.values())) - 1
+    first = len(next(iter(paths.values()))) - 1  # steps of the panel that is labelled
 
     def frame(step: int) -> None:
         step = min(step, last)
         for dot, path in zip(dots, paths.values(), strict=True):
             dot.set_offsets(path[min(step, len(path) - 1)])
-        axes[0].set_xlabel(f"$a_{{{last - step}}}$")
+        axes[0].set_xlabel(f"$a_{{{max(first - step, 0)}}}$")
 
     FuncAnimation(figure, frame, frames=last + 5).save(file, PillowWriter(fps=3), dpi=80)
