@@ -33,10 +33,11 @@ help:  ## list the targets
 install: $(INSTALLED)  ## create .venv and install the tested versions (PYTHON=python3.12, EXTRAS=all)
 
 $(INSTALLED): pyproject.toml constraints.txt
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
-	  echo "constraints.txt needs Python >= 3.11, and '$(PYTHON)' is not that: try make PYTHON=python3.11 ..."; exit 1; }
+	@$(VENV) -m pip --version > /dev/null 2>&1 || { \
+	  $(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+	    echo "constraints.txt needs Python >= 3.11, and '$(PYTHON)' is not that: try make PYTHON=python3.11 ..."; exit 1; }; \
+	  $(PYTHON) -m venv .venv; }
 	@echo "Installing torchrl-aca[$(EXTRAS)] into .venv (a few minutes the first time) ..."
-	@$(PYTHON) -m venv .venv
 	@$(WITH_TMPDIR) $(VENV) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[$(EXTRAS)]"
 	@touch $@
 

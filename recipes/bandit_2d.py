@@ -27,7 +27,7 @@ from pathlib import Path
 
 import hydra
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from torchrl import logger as torchrl_logger
 from tqdm import tqdm
 
@@ -81,6 +81,11 @@ def run_all(
 
 
 def study(cfg: BanditConfig, run_dir: Path) -> None:
+    """Runs what the configuration asks for: all methods as they are, or an ablation of them."""
+    (ablate if cfg.ablation.wanted() else compare)(cfg, run_dir)
+
+
+def compare(cfg: BanditConfig, run_dir: Path) -> None:
     """Runs all methods and seeds; writes the tables and, where asked for, the figures."""
     tasks = [(cfg, method, seed) for method in cfg.methods for seed in cfg.seeds]
     reported, swept, actors = [], [], {}
@@ -116,10 +121,7 @@ def ablate(cfg: BanditConfig, run_dir: Path) -> None:
 @hydra.main(version_base="1.3", config_path="configs", config_name="bandit_2d")
 def main(composed: DictConfig) -> None:
     """Runs the study or its ablation."""
-    wanted = any(
-        OmegaConf.select(composed, f"ablation.{part}") for part in ("training", "sampling")
-    )
-    launch(composed, BanditConfig, "bandit_2d", ablate if wanted else study)
+    launch(composed, BanditConfig, "bandit_2d", study)
 
 
 if __name__ == "__main__":

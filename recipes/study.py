@@ -30,11 +30,11 @@ def run(cfg: StudyConfig) -> int:
     if cfg.status:
         print(status_table(jobs))
         return 0
+    write_study(cfg)
     open_jobs = [job for job in jobs if state_of(job).name not in ("done", "running")]
     if cfg.study.recipe == "o2o_halfcheetah":
         for job in open_jobs:  # here, as two jobs would make the same data at the same time
             prepare_data(job.config)
-    write_study(cfg)
     print(f"{study_dir(cfg)}: {len(open_jobs)} of {len(jobs)} jobs to do", flush=True)
     failed = 0
     with StopSignal() as stop:
@@ -56,6 +56,8 @@ def main(cfg: DictConfig) -> None:
         failed = run(checked(StudyConfig, cfg))
     except (DatasetError, RunError) as error:
         raise SystemExit(f"error: {error}") from None
+    except KeyboardInterrupt:  # the jobs have not begun: they answer it themselves
+        raise SystemExit("stopped before the first job; the same command goes on") from None
     if failed:
         raise SystemExit(f"{failed} failed: output.txt of their directories says why")
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from omegaconf import OmegaConf
 
 from curves import make_panels
-from evaluations import by_setting, names, place_in_study, read_csv, read_study
+from evaluations import by_setting, names, place_in_study, read_csv, read_study, rows_of_run
 from figures import draw_settings
 from torchrl_aca.training.files import write_csv
 
@@ -55,7 +55,7 @@ def write_weights(study: Path) -> None:
         config = OmegaConf.load(path.with_name("config.yaml"))
         task, method = place_in_study(path.parent, config)
         run = {"task": task, "method": method, "seed": config.seed}
-        rows += [{**run, **row} for row in read_csv(path)]
+        rows += [{**run, **row} for row in rows_of_run(path)]
     if not rows:
         raise SystemExit(f"error: {study}: expected runs of methods named auto..., found none.")
     header = ("task", "method", "seed", *measured)

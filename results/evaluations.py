@@ -67,14 +67,14 @@ def _value(path: Path, name: str, text: str) -> Any:
         ) from None
 
 
-def _rows_of_run(path: Path) -> list[Row]:
+def rows_of_run(path: Path) -> list[Row]:
     """The rows of a table that a run may still be writing."""
     return [numbers(path, row) for row in files.read_csv(path)[1]]
 
 
 def read_evaluations(run_dir: Path) -> tuple[DictConfig, list[Row]]:
     """The configuration of a run, and its evaluations, those of an offline phase below zero."""
-    rows, config = _rows_of_run(run_dir / "eval.csv"), OmegaConf.load(run_dir / "config.yaml")
+    rows, config = rows_of_run(run_dir / "eval.csv"), OmegaConf.load(run_dir / "config.yaml")
     for row in rows:
         row["updates"] += row.get("offline_updates", 0) - _offline_updates(config)
     return config, rows
@@ -122,7 +122,7 @@ def read_run(run_dir: Path) -> list[Row]:
     if len({row["updates"] for row in rows}) < 2:
         return []
     path = run_dir / "metrics.csv"
-    metrics = _rows_of_run(path) if path.exists() else []
+    metrics = rows_of_run(path) if path.exists() else []
     speeds = [row["updates_per_second"] for row in metrics if row.get("updates_per_second")]
     (task, method), versions = place_in_study(run_dir, config), _versions(run_dir)
     own = {
@@ -206,7 +206,7 @@ def last_shared(rows: Sequence[Row], task: str) -> float:
     if not (places := shared(runs)):
         raise SystemExit(
             f"error: the runs of {task} have no evaluation at the same place. Leave out what has "
-            "hardly begun, or name places with --at."
+            "hardly begun; report.py compares elsewhere with --at."
         )
     return places[-1]
 

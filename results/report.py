@@ -162,23 +162,29 @@ def draw_curves(rows: Sequence[Row], path: Path, labels: tuple[str, str], lines:
 
 def write_report(rows: Sequence[Row], out: Path, args: argparse.Namespace) -> str:
     """Writes the CSV, the figures and the card, and returns the card."""
-    out.mkdir(parents=True, exist_ok=True)
+    shown = viewed(rows, args.x, args.value)
+    beside = (args.x, args.value) == ("updates", "return_mean")
+    table = task_table(shown, args.at, args.x, beside)
+    tasks, found = scores(shown, args.at[-1] if args.at else None)
+    lines = parse_lines(args.line)
+    out.mkdir(parents=True, exist_ok=True)  # from here on nothing is refused any more
     write_csv(out / "evaluations.csv", COLUMNS, rows)
-    runs = runs_table(rows)
-    rows = viewed(rows, args.x, args.value)
     named = {"return_mean": "mean return", "normalized_score": "normalised score"}[args.value]
-    draw_curves(rows, out / "curves.png", (args.x, named), parse_lines(args.line))
+    draw_curves(shown, out / "curves.png", (args.x, named), lines)
     parts = [
         f"# {out.name}\n",
         f"{named.capitalize()} and 95 % bootstrap interval over n seeds; the paper's ± is a 95 % "
         "interval.\n",
-        task_table(rows, args.at, args.x, (args.x, args.value) == ("updates", "return_mean")),
+        table,
         "\n![curves](curves.png)",
     ]
-    tasks, found = scores(rows, args.at[-1] if args.at else None)
     if len(found) > 1:
-        parts += [aggregates(rows, tasks, found, out)]
-    parts += ["\n## Runs\n", runs, f"\nTables and figures again: `{command(out, args)}`"]
+        parts += [aggregates(shown, tasks, found, out)]
+    parts += [
+        "\n## Runs\n",
+        runs_table(rows),
+        f"\nTables and figures again: `{command(out, args)}`",
+    ]
     card = "\n".join(parts) + "\n" + notes(out / "card.md")
     (out / "card.md").write_text(card)
     return card

@@ -268,6 +268,11 @@ def test_a_value_that_only_a_part_can_refuse_is_told_before_a_directory_is_made(
     "value",
     [
         "runs/a-b.c",
+        "here",
+        "null",
+        "2024",
+        "1e3",
+        ".5",
         "/a/env=hopper,seed=0",
         "/a b/(x)",
         "ü#&~",

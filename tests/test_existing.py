@@ -66,3 +66,28 @@ def test_a_job_of_a_sweep_that_fails_is_told_and_the_others_go_on(tmp_path):
     code, _, errors = run("--multirun", *TINY["sac"], *jobs, cwd=tmp_path)
     assert code == 1 and "error: optim.gamma=7: expected less than or equal to 1" in errors
     assert [path.parent.name for path in sorted(tmp_path.glob("jobs/*/done"))] == ["0.8", "0.9"]
+
+
+def test_a_run_that_was_killed_at_its_end_goes_on_where_more_or_less_is_asked(tmp_path):
+    assert run(*HERE, cwd=tmp_path)[0] == 0
+    for asked, status, told in (
+        ("optim.total_updates=abc", 1, "optim.total_updates='abc': expected a valid integer"),
+        ("optim.total_updates=30", 1, "already has 60 updates; expected"),
+        ("optim.total_updates=65", 0, ""),
+    ):
+        (tmp_path / "here" / "done").unlink(missing_ok=True)
+        code, _, errors = run("resume=here", asked, cwd=tmp_path)
+        assert (code, told in errors, "Traceback" in errors) == (status, True, False)
+        assert (tmp_path / "here" / "done").exists() == (status == 0)
+    assert rows_of(tmp_path / "here" / "eval.csv")[-1]["updates"] == "65"
+
+
+def test_a_run_that_its_return_has_ended_and_a_kill_is_finished(tmp_path):
+    typed = [*HERE, "eval.stop_return=-1000"]  # which any policy has reached
+    assert run(*typed, cwd=tmp_path)[0] == 0
+    updates = rows_of(tmp_path / "here" / "eval.csv")[-1]["updates"]
+    assert int(updates) < 60
+    (tmp_path / "here" / "done").unlink()
+    code, output, errors = run(*typed, cwd=tmp_path)
+    assert (code, errors) == (0, "")
+    assert output == f"here has all its {updates} updates: nothing to do\n"

@@ -230,20 +230,20 @@ def test_a_fixed_weight_stays_and_what_auto_needs_is_told():
         make_loss(guidance_weight="automatic")
 
 
-def test_nan_in_a_terminal_state_moves_no_weight():
-    loss = make_loss(guidance_weight="auto", num_target_candidates=4)
-    data, weights = make_data(6), []
+def test_nan_in_terminal_states_moves_no_weight():
+    loss, data = make_loss(guidance_weight="auto", num_target_candidates=4), make_data(6)
     data["next", "terminated"][2] = data["next", "done"][2] = True
-    for value in (float("nan"), 0.0):
-        data["next", "observation"][2] = value
-        other = copy.deepcopy(loss)
-        torch.manual_seed(0)
-        assert other.qvalue_loss(data)["loss_qvalue"].isfinite()
-        if value == 0.0:  # what is left out is this state
-            keys = other.tensor_keys
-            for key in (keys.candidate_spread, keys.guidance_gain):
-                data[key] = data[key].masked_fill(data["next", "terminated"].squeeze(-1), torch.nan)
-        other.step_guidance_weight(data)
-        weights.append(other.actor_network.guidance_weight.item())
-    assert math.isfinite(weights[0])
-    assert weights[0] == pytest.approx(weights[1], rel=0.02)  # but for its part in the scale
+    data["next", "observation"][2] = torch.nan
+    assert loss.qvalue_loss(data)["loss_qvalue"].isfinite()
+    keys = loss.tensor_keys
+    spread, gain = data[keys.candidate_spread], data[keys.guidance_gain]
+    assert spread.isnan().tolist() == gain.isnan().tolist() == [False, False, True] + 3 * [False]
+    alone = data[[0, 1, 3, 4, 5]]
+    other = copy.deepcopy(loss)
+    for each, rows in ((loss, data), (other, alone)):
+        each.step_guidance_weight(rows)
+    weight = loss.actor_network.guidance_weight
+    assert weight != 50 and weight == other.actor_network.guidance_weight
+    before = weight.item()
+    loss.step_guidance_weight(data[[2]])  # nothing to go by
+    assert weight.item() == before

@@ -366,6 +366,8 @@ def test_an_online_half_on_its_own_may_lie_on_another_device():
     for _ in range(2):
         whole.extend(rows(3))
     assert whole.sample()["action"].device.type == "meta"
+    with pytest.raises(ValueError, match="the layout of the rows.*'action' expected torch.float32"):
+        whole.extend(rows(3).apply(lambda x: x.double() if x.is_floating_point() else x))
 
 
 def mismatches():

@@ -231,7 +231,7 @@ def test_what_cannot_be_reported_is_told_and_nothing_is_written(
     call = [sys.executable, str(SCRIPT), str(tmp_path / source), str(tmp_path / "out"), *options]
     done = subprocess.run(call, capture_output=True, text=True)
     assert done.returncode == 1 and told in done.stderr and "Traceback" not in done.stderr
-    assert not (tmp_path / "out" / "card.md").exists()
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_column_of_ones_own_is_left_out_and_no_row_is_lost(study, tmp_path):

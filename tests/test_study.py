@@ -218,7 +218,7 @@ def test_data_are_made_once_before_the_jobs_and_missing_ones_are_told(tmp_path):
     code, output, errors = run(*command, missing, cwd=tmp_path, recipe="study")
     assert (code, output) == (1, "")
     assert errors.startswith("error: mine: expected the directory of a data set, found nothing")
-    assert not (tmp_path / "runs").exists()
+    assert [path.name for path in (tmp_path / "runs/studies/mine").iterdir()] == ["study.yaml"]
 
     code, output, errors = run(*command, cwd=tmp_path, recipe="study")
     assert code == 0, errors

@@ -267,6 +267,12 @@ def test_a_wandb_id_is_of_one_run_for_as_long_as_it_goes_on(tmp_path):
     assert first != other
     assert _wandb_id(runs[0], new=False) == first
     assert _wandb_id(runs[0], new=True) not in (first, other)
+    for folder, name in (("begun without", None), ("of an earlier version", "Hopper-v4-sac-s0")):
+        run_dir = tmp_path / folder / "Hopper-v4-sac-s0"
+        (run_dir / "wandb" if name else run_dir).mkdir(parents=True)
+        found = _wandb_id(run_dir, new=False)
+        assert found == _wandb_id(run_dir, new=False)
+        assert (found == name) if name else len(found) == 32
 
 
 def test_the_first_signal_is_answered_at_once():

@@ -123,9 +123,8 @@ def _split(
         else [module]
     )
     encoder, head = [], []
-    used = set(
-        row_keys
-    )  # what the head reads or writes: a part in front of it must not change that
+    # A part in front of the head must write nothing that the head has read or written before.
+    used = set(row_keys)
     for part in parts:
         reads, writes = (cast("list[NestedKey]", keys) for keys in (part.in_keys, part.out_keys))
         if row_keys.isdisjoint(reads) and used.isdisjoint(writes):

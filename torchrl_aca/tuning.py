@@ -148,11 +148,11 @@ class AutoGuidance:
             KeyError: if they have not written it.
         """
         keys = self.tensor_keys
-        # Terminal states may hold NaN, which no other loss sees either.
+        # Terminal states may hold NaN, which no other loss sees either; of them alone is no step.
         spread = tensordict[keys.candidate_spread].square().nanmean().sqrt()
         gain = tensordict[keys.guidance_gain].nanmean()
-        step = self.guidance_weight_lr * F.guidance_step(spread, self.target_spread, gain)
+        step = F.guidance_step(spread, self.target_spread, gain).nan_to_num(nan=0.0)
         # In place: actor, loss and whoever else holds the weight see the new one.
-        self.guidance_weight.mul_(step.exp())
+        self.guidance_weight.mul_((self.guidance_weight_lr * step).exp())
         metrics = {"candidate_spread": spread, "guidance_gain": gain}
         return TensorDict({"guidance_weight": self.guidance_weight.to(spread.dtype), **metrics})

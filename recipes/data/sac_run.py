@@ -15,11 +15,16 @@ from agents import AGENTS, without_methods
 from torchrl_aca.errors import RunError
 from torchrl_aca.training.checkpoint import list_checkpoints
 from torchrl_aca.training.config import override
-from torchrl_aca.training.resume import apply_overrides, is_finished, read_config, require_equal
+from torchrl_aca.training.resume import (
+    ENDS,
+    apply_overrides,
+    is_finished,
+    read_config,
+    require_equal,
+)
 from torchrl_aca.training.signals import STOPPED, StopSignal, run_command
 
 SCRIPT = Path(__file__).parents[1] / "online_mujoco.py"
-ENDS = ("eval.stop_return", "optim.total_updates")  # where the run ends is this command's say
 
 
 def finished_sac_run(env_name: str, seed: int, overrides: Sequence[str], run_dir: Path) -> Path:

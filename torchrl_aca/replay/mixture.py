@@ -194,11 +194,10 @@ class MixedReplayBuffer:
     def _check_online(self) -> None:
         """Check once the rows that reached the online buffer by another way than `extend`."""
         if not self._online_is_checked and len(self.online):
-            # On its own it may lie on another device than what is added to it.
-            self._check(self.online.storage[:1], "The online half", mixed=len(self._offline) > 0)
+            self._check(self.online.storage[:1], "The online half")
             self._online_is_checked = True
 
-    def _check(self, rows: TensorDictBase, name: str, mixed: bool = True) -> None:
+    def _check(self, rows: TensorDictBase, name: str) -> None:
         if N_STEPS not in self.keys and rows.get(N_STEPS, None) is not None:
             raise ValueError(
                 f"{name} has {N_STEPS!r}, so its rewards are sums over several steps, but the "
@@ -206,9 +205,9 @@ class MixedReplayBuffer:
                 "key, or leave MultiStepTransform out."
             )
         layout = layout_of(rows, self.keys, name)
-        if mixed:
-            self._layout = self._layout or layout
-            require_layout(layout, self._layout, name)
+        self._layout = self._layout or layout
+        # On its own, the online half may lie on another device than what is added to it.
+        require_layout(layout, self._layout, name, one_device=len(self._offline) > 0)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the generator's state, the online rows and a fingerprint of the offline data.

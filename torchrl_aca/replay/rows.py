@@ -84,14 +84,20 @@ def layout_of(rows: TensorDictBase, keys: Sequence[NestedKey], name: str) -> Lay
     return layout
 
 
-def require_layout(got: Layout, expected: Layout, name: str) -> None:
+def require_layout(got: Layout, expected: Layout, name: str, one_device: bool = True) -> None:
     """Compare the layout of rows with that of the rows that they will be mixed with.
+
+    Args:
+        got: of the rows.
+        expected: of those that they will be mixed with.
+        name: what the rows are.
+        one_device: compare the devices as well.
 
     Raises:
         ValueError: naming the first key that differs.
     """
     for key, entry in expected.items():
-        if got[key] != entry:
+        if got[key][:2] != entry[:2] or (one_device and got[key] != entry):
             raise ValueError(
                 f"{name} must have the layout of the rows that it is mixed with: for {key!r} "
                 f"expected {_describe(*entry)}, got {_describe(*got[key])}. Convert one of the "

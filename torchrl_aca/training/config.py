@@ -202,9 +202,13 @@ def checked(schema: type[Schema], cfg: DictConfig | dict[str, Any]) -> Schema:
 
 
 def override(key: str, value: object) -> str:
-    """`key=value` as Hydra reads it from a command, whatever characters the value has."""
+    """`key=value` as Hydra reads it from a command: a text, whatever it looks like.
+
+    But for `${`, which begins an interpolation in quotes as well.
+    """
     text = str(value)
-    if re.fullmatch(r"[\w./+@-]+", text, re.ASCII):
+    plain = re.fullmatch(r"[A-Za-z][\w.+@-]*|[\w.+@-]*/[\w./+@-]*", text, re.ASCII)
+    if plain and text.lower() not in ("null", "true", "false", "inf", "nan"):
         return f"{key}={text}"
     # Within quotes a backslash is one, but for those in front of a quote.
     escaped = re.sub(r'(\\*)("|$)', lambda m: 2 * m[1] + m[2].replace('"', '\\"'), text)

@@ -16,12 +16,15 @@ from torchrl_aca.errors import DatasetError, RunError
 from torchrl_aca.training.checkpoint import list_checkpoints, read_checkpoint
 from torchrl_aca.training.files import write_text
 from torchrl_aca.training.resume import (
+    ENDS,
     continued_config,
+    has_ended,
     is_finished,
     read_config,
+    read_evaluations,
     resumed_config,
 )
-from torchrl_aca.training.run_dir import DONE
+from torchrl_aca.training.run_dir import DONE, lock
 from torchrl_aca.training.signals import STOPPED
 
 Train = Callable[[DictConfig, "dict[str, Any] | None"], Path]
@@ -81,9 +84,13 @@ def start(train: Train, cfg: DictConfig, overrides: Iterable[str]) -> Path:
 def _go_on(train: Train, cfg: DictConfig, checkpoint: dict[str, Any]) -> Path:
     """Trains from a checkpoint, but for a run that was killed between its last one and its end."""
     run_dir, updates = Path(cfg.resume), checkpoint["parts"]["counters"]["updates"]
-    if updates < cfg.optim.total_updates or (run_dir / DONE).exists():
+    stored, rows = OmegaConf.create(checkpoint["config"]), read_evaluations(run_dir)
+    as_before = all(OmegaConf.select(cfg, key) == OmegaConf.select(stored, key) for key in ENDS)
+    at_its_end = has_ended(rows, stored) and rows[-1]["updates"] == updates
+    if (run_dir / DONE).exists() or not (as_before and at_its_end):
         return train(cfg, checkpoint)
-    write_text(run_dir / DONE, f"{updates}\n")
+    with lock(run_dir):
+        write_text(run_dir / DONE, f"{updates}\n")
     print(f"{run_dir} has all its {updates} updates: nothing to do", flush=True)
     return run_dir
 

@@ -170,7 +170,8 @@ def _wandb_id(run_dir: Path, new: bool) -> str:
     """An id that no other run has, kept for the time when this one is resumed."""
     path = run_dir / "wandb_id"
     if new or not path.exists():
-        write_text(path, uuid.uuid4().hex)
+        earlier = not new and (run_dir / "wandb").exists()  # of a version whose id was the name
+        write_text(path, run_dir.name if earlier else uuid.uuid4().hex)
     return path.read_text()
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ MAY_CHANGE_ON_RESUME = (
     "video",
     "eval.stop_return",
 )
+ENDS = ("optim.total_updates", "eval.stop_return")  # where a run ends
 NOT_COMPARED = (*MAY_CHANGE_ON_RESUME, "resume", "run_dir", "existing")
 
 
@@ -83,11 +84,13 @@ def is_finished(run_dir: Path, cfg: Any) -> bool:
         run_dir: The run's directory; it may be missing.
         cfg: A configuration with `optim.total_updates` and `eval.stop_return`.
     """
-    if not (run_dir / DONE).exists():
-        return False
-    rows = read_evaluations(run_dir)
-    updates = rows[-1]["updates"] if rows else 0
-    return updates >= cfg.optim.total_updates or has_reached(rows, cfg.eval.stop_return)
+    return (run_dir / DONE).exists() and has_ended(read_evaluations(run_dir), cfg)
+
+
+def has_ended(evaluations: Sequence[Mapping[str, float]], cfg: Any) -> bool:
+    """Tells whether these evaluations reach the end that a configuration has."""
+    updates = evaluations[-1]["updates"] if evaluations else 0
+    return updates >= cfg.optim.total_updates or has_reached(evaluations, cfg.eval.stop_return)
 
 
 def read_evaluations(run_dir: Path) -> list[dict[str, float]]:
