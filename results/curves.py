@@ -41,11 +41,18 @@ def draw_marks(axes: Axes, lines: Mapping[str, float]) -> None:
 
 
 def draw_mean(axes: Axes, label: str, runs: Sequence[Returns]) -> Line2D:
-    """The mean of runs where all were evaluated, with its 95 % interval where there are several."""
+    """The mean of runs where all were evaluated, with its 95 % interval where there are several.
+
+    What longer runs have beyond that is dotted, each for itself.
+    """
     places = shared(runs)
     values = [np.array([run[place] for run in runs]) for place in places]
     (line,) = axes.plot(places, [v.mean() for v in values], marker="o", markersize=3, label=label)
     if places and len(runs) > 1:
         low, high = zip(*(interval(mean, [v]) for v in values), strict=True)
         axes.fill_between(places, low, high, alpha=0.2, color=line.get_color(), linewidth=0)
+    for run in runs:
+        beyond = sorted(place for place in run if not places or place >= places[-1])
+        returns = [run[place] for place in beyond]
+        axes.plot(beyond, returns, linestyle=":", linewidth=1, color=line.get_color())
     return line
