@@ -54,5 +54,6 @@ def draw_mean(axes: Axes, label: str, runs: Sequence[Returns]) -> Line2D:
     for run in runs:
         beyond = sorted(place for place in run if not places or place >= places[-1])
         returns = [run[place] for place in beyond]
-        axes.plot(beyond, returns, linestyle=":", linewidth=1, color=line.get_color())
+        if len(beyond) > 1:
+            axes.plot(beyond, returns, linestyle=":", linewidth=1, color=line.get_color())
     return line

@@ -80,8 +80,7 @@ def test_the_yardstick_updates_as_the_loss_does(monkeypatch):
 
 
 def targets_of(loss) -> dict[str, torch.Tensor]:
-    params = loss.target_qvalue_network_params.flatten_keys(".")
-    return {name: params[name] for name in params}
+    return dict(loss.target_qvalue_network_params.flatten_keys(".").items())
 
 
 def test_the_report_divides_by_yardstick_and_roofline():

@@ -33,7 +33,7 @@ ALLOWED = {
     "chain": {"checks", "functional", "schedule"},
     "chain_policy": {"checks", "chain"},
     "critic": {"activations", "checks", "functional", "stacked"},
-    "custom_critic": {"functional", "critic"},
+    "custom_critic": {"checks", "functional", "critic"},
     "actor": {
         "checks",
         "functional",

@@ -82,6 +82,17 @@ def test_a_curve_is_its_mean_with_an_interval_over_seeds_or_episodes(plot, tmp_p
         assert (min(at_ten), max(at_ten)) == band
 
 
+def test_what_a_longer_run_has_beyond_the_others_is_dotted(plot, tmp_path):
+    longer = write_run(tmp_path / "longer", {0: 1.0, 10: 2.0, 20: 5.0, 30: 6.0}, seed=0)
+    shorter = write_run(tmp_path / "shorter", {0: 3.0, 10: 4.0}, seed=1)
+    axes = Figure().subplots()
+    plot.draw(axes, *plot.make_curves([longer, shorter]), "both")
+    mean, beyond = axes.lines
+    assert (mean.get_xdata().tolist(), mean.get_ydata().tolist()) == ([0, 10], [2.0, 3.0])
+    assert (list(beyond.get_xdata()), list(beyond.get_ydata())) == ([10, 20, 30], [2.0, 5.0, 6.0])
+    assert beyond.get_linestyle() == ":"
+
+
 def test_each_task_has_a_panel_and_frames_may_be_the_axis(plot, tmp_path, monkeypatch, capsys):
     for task, values in (("A-v1", {0: 1.0, 10: 2.0}), ("B-v1", {0: 3.0, 10: 4.0})):
         path = write_run(tmp_path / task, values, env={"name": task})
