@@ -6,6 +6,7 @@ import os
 import re
 import signal
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -113,6 +114,24 @@ def test_a_part_of_a_study_leaves_the_names_of_the_rest(tmp_path):
         write_study(other)
 
 
+def test_parts_that_begin_at_the_same_time_lose_no_name(tmp_path):
+    parts = [
+        checked(
+            StudyConfig,
+            composed("study=tiny", f"~study.methods.{m}", f"dir={tmp_path}", name="study"),
+        )
+        for m in ("aca", "sac")
+    ]
+    for _ in range(20):
+        (tmp_path / "study.yaml").unlink(missing_ok=True)
+        with ThreadPoolExecutor(2) as pool:
+            list(pool.map(write_study, parts))
+        assert set(yaml.safe_load((tmp_path / "study.yaml").read_text())["methods"]) == {
+            "aca",
+            "sac",
+        }
+
+
 def write_progress(run_dir: Path, updates: int, seconds: float, done: bool = False) -> None:
     run_dir.mkdir(parents=True)
     (run_dir / "metrics.csv").write_text(
@@ -218,7 +237,8 @@ def test_data_are_made_once_before_the_jobs_and_missing_ones_are_told(tmp_path):
     code, output, errors = run(*command, missing, cwd=tmp_path, recipe="study")
     assert (code, output) == (1, "")
     assert errors.startswith("error: mine: expected the directory of a data set, found nothing")
-    assert [path.name for path in (tmp_path / "runs/studies/mine").iterdir()] == ["study.yaml"]
+    made = {path.name for path in (tmp_path / "runs/studies/mine").iterdir()}
+    assert made == {"study.yaml", ".study.lock"}
 
     code, output, errors = run(*command, cwd=tmp_path, recipe="study")
     assert code == 0, errors

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import hydra
+from filelock import FileLock
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
@@ -167,13 +168,14 @@ def write_study(cfg: StudyConfig) -> None:
         RunError: If the directory is that of another study.
     """
     path, study = study_dir(cfg) / "study.yaml", OmegaConf.create(cfg.study.model_dump())
-    if path.exists():
-        found = OmegaConf.load(path)
-        if found.name != study.name:
-            raise RunError(
-                f"dir={path.parent} holds the study {found.name}; expected a new directory."
-            )
-        for key in ("tasks", "methods"):  # a part of a study may be run on its own
-            study[key] = {**found[key], **study[key]}
     path.parent.mkdir(parents=True, exist_ok=True)
-    OmegaConf.save(study, path)
+    with FileLock(path.with_name(".study.lock")):  # parts may be begun at the same time
+        if path.exists():
+            found = OmegaConf.load(path)
+            if found.name != study.name:
+                raise RunError(
+                    f"dir={path.parent} holds the study {found.name}; expected a new directory."
+                )
+            for key in ("tasks", "methods"):  # a part of a study may be run on its own
+                study[key] = {**found[key], **study[key]}
+        OmegaConf.save(study, path)
