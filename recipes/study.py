@@ -56,8 +56,8 @@ def main(cfg: DictConfig) -> None:
         failed = run(checked(StudyConfig, cfg))
     except (DatasetError, RunError) as error:
         raise SystemExit(f"error: {error}") from None
-    except KeyboardInterrupt:  # the jobs have not begun: they answer it themselves
-        raise SystemExit("stopped before the first job; the same command goes on") from None
+    except KeyboardInterrupt:  # while data are made, or the second Ctrl-C
+        raise SystemExit("stopped; the same command goes on") from None
     if failed:
         raise SystemExit(f"{failed} failed: output.txt of their directories says why")
 

@@ -47,10 +47,10 @@ Scores = dict[str, list[np.ndarray]]  # of each method, for each task
 def read_csv(path: Path) -> list[Row]:
     """The rows of a CSV file, numbers as numbers."""
     with open(path, newline="") as file:
-        return [numbers(path, row) for row in csv.DictReader(file)]
+        return [_numbers(path, row) for row in csv.DictReader(file)]
 
 
-def numbers(path: Path, row: Mapping[str, str]) -> Row:
+def _numbers(path: Path, row: Mapping[str, str]) -> Row:
     """A row of a table with its numbers as numbers."""
     return {name: _value(path, name, text) for name, text in row.items()}
 
@@ -69,7 +69,7 @@ def _value(path: Path, name: str, text: str) -> Any:
 
 def rows_of_run(path: Path) -> list[Row]:
     """The rows of a table that a run may still be writing."""
-    return [numbers(path, row) for row in files.read_csv(path)[1]]
+    return [_numbers(path, row) for row in files.read_csv(path)[1]]
 
 
 def read_evaluations(run_dir: Path) -> tuple[DictConfig, list[Row]]:

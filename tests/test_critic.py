@@ -269,7 +269,7 @@ def test_first_level_is_0_or_1(first_level):
 )
 def test_the_base_names_the_method_that_a_subclass_lacks(method, missing):
     class Unfinished(NoiseLevelCriticBase):
-        pass
+        """Defines nothing."""
 
     arguments = [torch.zeros(1)] * (1 if method == "encode" else 3)
     with pytest.raises(NotImplementedError, match=f"Unfinished must define {missing}"):

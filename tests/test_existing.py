@@ -36,7 +36,7 @@ def test_the_same_command_goes_on_after_a_kill_and_then_has_nothing_to_do(tmp_pa
         assert output == "here has all its 60 updates: nothing to do\n"
         assert (tmp_path / "here" / "done").read_text() == "60\n"
         (tmp_path / "here" / "done").unlink()
-    code, output, errors = run(*HERE, cwd=tmp_path)
+    run(*HERE, cwd=tmp_path)
     code, output, errors = run(*HERE, cwd=tmp_path)
     assert output == "here is finished: nothing to do\n"
     config = tmp_path / "here" / "config.yaml"

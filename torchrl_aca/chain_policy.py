@@ -83,8 +83,9 @@ class ChainPolicy(TensorDictModuleBase):
         low, high = torch.full(leaf.shape, -1.0), torch.full(leaf.shape, 1.0)
         if spec is not None:
             low, high = leaf.space.low, leaf.space.high
-        bounds = {"low": low, "high": high, "center": (high + low) / 2}
-        for name, value in {**bounds, "half_range": (high - low) / 2}.items():
+        center, half_range = (high + low) / 2, (high - low) / 2
+        buffers = {"low": low, "high": high, "center": center, "half_range": half_range}
+        for name, value in buffers.items():
             self.register_buffer(name, value.to(like), persistent=False)
 
     def to_env(self, action: Tensor) -> Tensor:

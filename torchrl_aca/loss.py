@@ -348,7 +348,7 @@ class ACALoss(OpenLoopAlpha, AutoGuidance, TDLoss):
         self._tie_guidance()
 
     def _take_loaded(self) -> None:
-        self._take_loaded_guidance()
+        self.actor_network.guidance_weight = self.guidance_weight  # fills the actor's buffer
         super()._take_loaded()
 
     def _apply(self, fn: Callable) -> ACALoss:

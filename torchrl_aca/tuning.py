@@ -110,10 +110,6 @@ class AutoGuidance:
         """Take the actor's buffer, whatever has become of it."""
         self.guidance_weight = self.actor_network.guidance_weight
 
-    def _take_loaded_guidance(self) -> None:
-        """Give the actor the weight that a state dict has put into the loss."""
-        self.actor_network.guidance_weight.copy_(self.guidance_weight)
-
     def _candidates(self, features: Any, noise: Tensor) -> Tensor:
         """The target's candidates ``(N, B, A)``; to tune ``w``, from a little above and below."""
         actor = self.actor_network

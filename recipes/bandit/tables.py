@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import itertools
 import statistics
 from collections.abc import Mapping, Sequence
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from bandit.env import HIGH_MODES
+from torchrl_aca.training import files
 
 METHODS = {
     "aca": "ACA",
@@ -83,11 +83,10 @@ def write_card(run_dir: Path, info: Mapping[str, Any]) -> None:
 def write_csv(path: Path, rows: Sequence[Row]) -> None:
     """Writes the rows below their keys; numbers to four digits after the point."""
     names = list(dict.fromkeys(itertools.chain.from_iterable(rows)))
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, names)
-        writer.writeheader()
-        for row in rows:
-            writer.writerow({k: round(v, 4) if isinstance(v, float) else v for k, v in row.items()})
+    rounded = (
+        {k: round(v, 4) if isinstance(v, float) else v for k, v in row.items()} for row in rows
+    )
+    files.write_csv(path, names, rounded)
 
 
 def as_text(rows: Sequence[Mapping[str, Any]]) -> str:
