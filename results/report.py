@@ -13,7 +13,7 @@ runs join a table whose own are gone. Needs SciPy and the `recipes` extra.
 
 Scores are values on a scale of each task: 0 is the mean before training, 1 the best mean of a
 method in this study. Methods are compared at the same updates or frames: on each task the last at
-which all its runs were evaluated, or `--at`, the last of which the scores are of.
+which all its runs were evaluated, or `--at`; scores are of the place that is given last.
 """
 
 from __future__ import annotations
@@ -61,9 +61,9 @@ def _line(cells: Sequence[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-def number(value: float) -> str:
-    """A return as the paper writes it."""
-    return f"{value:.1f}" if abs(value) < 100 else f"{value:.0f}"
+def number(value: float, like: float | None = None) -> str:
+    """A return as the paper writes it, one below 100 with a decimal; or as `like` has them."""
+    return f"{value:.{int(abs(value if like is None else like) < 100)}f}"
 
 
 def ranged(value: float, found: tuple[float, float] | None) -> str:
@@ -88,7 +88,7 @@ def task_table(rows: Sequence[Row], places: Sequence[float], unit: str, beside: 
     """
     methods, lines = names(rows, "method"), []
     for task in names(rows, "task"):
-        for place in places or [last_shared(rows, task)]:
+        for place in sorted(places) or [last_shared(rows, task)]:
             values = [cell(values_at(rows, task, method, place)) for method in methods]
             if not any(values):
                 continue
@@ -119,7 +119,7 @@ def runs_table(rows: Sequence[Row]) -> str:
         offline = max(0, -first["updates"])
         updates = f"{offline:,.0f} + {row['updates']:,.0f}" if offline else f"{row['updates']:,.0f}"
         minutes = f"{row['seconds'] / 60:.0f}" if row["seconds"] != "" else ""
-        made = f"{row['return_mean']:.0f} ± {row['return_std']:.0f}"
+        made = number(row["return_mean"]) + " ± " + number(row["return_std"], row["return_mean"])
         counts = [f"{row['seed']:.0f}", updates, f"{row['frames']:,.0f}", made, minutes]
         lines.append([row["task"], row["method"], *counts, row["commit"][:7]])
     header = ["task", "method", "seed", "updates", "frames", "return", "minutes", "commit"]

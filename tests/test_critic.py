@@ -119,6 +119,11 @@ def test_keys_may_be_renamed_and_nested():
     torch.testing.assert_close(td["agent", "q"], critic(observation, action, level))
 
 
+def test_a_key_that_is_not_in_a_list_is_told():
+    with pytest.raises(ValueError, match=r"out_keys as a list of keys, such as \['q'\], got a str"):
+        make_critic(out_keys="q")
+
+
 def test_tensors_may_be_given_by_name():
     critic = make_critic()
     observation, action = draw(BATCH)

@@ -175,6 +175,21 @@ def test_an_offline_phase_is_below_zero_and_at_no_frame(tmp_path):
     assert "| Hopper-v4 | iql | 0 | 40 + 20 | 60 | 100 ± 1 | 0 | 0123456 |" in printed
 
 
+def test_places_stand_in_order_and_scores_are_of_the_one_given_last(study, tmp_path):
+    args = [str(study), str(tmp_path / "out"), "--at", "100000", "0"]
+    call = [sys.executable, str(SCRIPT), *args]
+    printed = subprocess.run(call, capture_output=True, text=True, check=True).stdout
+    assert printed.index("| Hopper-v4, 0 updates") < printed.index("| Hopper-v4, 100,000 updates")
+    assert evaluations.scores(rows_of(study), 0)[0] == [] and "interquartile" not in printed
+
+
+def test_small_returns_have_a_decimal_in_the_list_of_runs(tmp_path):
+    write_run(tmp_path / "runs", "aca", 0, {0: -11.34, 100: -9.96})
+    call = [sys.executable, str(SCRIPT), str(tmp_path / "runs"), str(tmp_path / "out")]
+    printed = subprocess.run(call, capture_output=True, text=True, check=True).stdout
+    assert "| Hopper-v4 | aca | 0 | 100 | 500 | -10.0 ± 1.0 | " in printed
+
+
 def test_scores_are_on_the_scale_of_their_task(study):
     tasks, found = evaluations.scores(rows_of(study), None)
     assert tasks == ["Hopper-v4"]

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from torchrl_aca import functional as F
 from torchrl_aca.activations import activate, activation_and_slope
+from torchrl_aca.checks import check_keys
 from torchrl_aca.stacked import StackedLinear
 
 __all__ = ["NoiseLevelCritic", "NoiseLevelCriticBase"]
@@ -146,7 +147,8 @@ class NoiseLevelCritic(NoiseLevelCriticBase):
 
     Raises:
         ValueError: if a size is not positive, ``embedding_dim`` is odd or there are fewer than
-            three ``in_keys``; in a call, if observations are not ``observation_dim`` numbers.
+            three ``in_keys``, or keys are not in a list; in a call, if observations are not
+            ``observation_dim`` numbers.
 
     Examples:
         >>> critic = NoiseLevelCritic(17, 6)
@@ -176,6 +178,7 @@ class NoiseLevelCritic(NoiseLevelCriticBase):
                 "NoiseLevelCritic expects in_keys=[*observation keys, action key, noise-level "
                 f"key], at least three, got {in_keys!r}."
             )
+        check_keys(out_keys=out_keys)
         *observation_keys, action_key, noise_level_key = in_keys
         super().__init__(observation_keys, action_key, noise_level_key, out_keys[0], first_level)
         sizes = (observation_dim, action_dim, num_steps, num_critics, *num_cells)
