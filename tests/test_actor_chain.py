@@ -79,6 +79,7 @@ def test_number_of_inference_steps_must_fit_the_levels(steps):
 
 def test_levels_are_chosen_or_given():
     assert make_actor().inference_levels == [1, 2, 3, 4, 5, 6]
+    assert make_actor(inference_levels=torch.tensor([1, 3, 6])).inference_levels == [1, 3, 6]
     assert make_actor(num_inference_steps=4).inference_levels == [1, 2, 3, 6]
     given = make_actor(inference_levels=(1, 4, 6))
     assert given.inference_levels == [1, 4, 6]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import math
 
 import pytest
@@ -10,8 +11,11 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import TanhNormal
+from torchrl.objectives import SoftUpdate
 
 from agents import AGENTS, configured, make_agent
+from agents.sac import make_loss, qvalue_loss
 from online_mujoco import train
 from recipe_cases import (
     CONFIGS,
@@ -24,6 +28,7 @@ from recipe_cases import (
 )
 from torchrl_aca.baselines import make_gaussian_policy
 from torchrl_aca.training.envs import make_vector_env
+from torchrl_aca.training.policy import PolicyBuilder
 from torchrl_aca.training.resume import resumed_config
 
 CPU = torch.device("cpu")
@@ -214,13 +219,43 @@ def test_its_page_has_its_parameter_count(algo, temperatures):
 
 @pytest.mark.parametrize("algo", ["sac", "rlpd"])
 def test_the_entropy_target_is_meant_for_actions_between_minus_one_and_one(algo):
-    """A unit Gaussian policy of std s on [-0.4, 0.4] has the entropy of s / 0.4 on [-1, 1]."""
-    agent = built(algo, env="humanoid", tiny=False)
-    target = agent.state["loss"].target_entropy
-    scale = {"sac": 1.0, "rlpd": 0.5}[algo]
-    # TorchRL's loss measures in env units, ours in [-1, 1]: their targets differ by the Jacobian.
-    jacobian = {"sac": 17 * torch.tensor(0.4).log().item(), "rlpd": 0.0}[algo]
-    assert float(target) == pytest.approx(-17 * scale + jacobian, abs=1e-4)
+    loss = built(algo, env="humanoid", tiny=False).state["loss"]
+    assert float(loss.target_entropy) == -17 * {"sac": 1.0, "rlpd": 0.5}[algo]
+
+
+def test_sac_backs_up_the_entropy_of_actions_between_minus_one_and_one():
+    """The value of a state does not depend on the units of the actions."""
+    targets = []
+    for bound in (1.0, 0.4):
+        cfg = configured(composed("algo=sac", "env=humanoid"))
+        torch.manual_seed(0)
+        builder = PolicyBuilder.of(
+            make_vector_env("Humanoid-v4", 1, 0), make_gaussian_policy, rescaled=True
+        )
+        builder = dataclasses.replace(builder, spec=Bounded(-bound, bound, shape=(17,)))
+        loss = make_loss(cfg, builder.build(CPU), builder, CPU)
+        for critic in loss.qvalue_network_params.values(True, True):
+            critic.data.zero_()
+        SoftUpdate(loss, tau=1.0).step()
+        rows = TensorDict(observation=torch.zeros(3, 376), batch_size=[3])
+        done = torch.zeros(3, 1, dtype=torch.bool)
+        rows["next"] = rows.copy().update(reward=torch.zeros(3, 1), done=done, terminated=done)
+        rows["action"] = torch.zeros(3, 17)
+        torch.manual_seed(1)
+        targets.append(qvalue_loss(loss, rows)["loss_qvalue"])  # two critics: sum of y squared
+    torch.testing.assert_close(*targets)
+
+
+def test_rescaled_scores_are_densities_of_actions_between_minus_one_and_one():
+    spec = Bounded(-3.0, 4.0, shape=(2,))
+    rows = TensorDict(observation=torch.randn(5, 3).double(), batch_size=[5])
+    dist = make_gaussian_policy(3, spec, rescaled=True).double().get_dist(rows)
+    unit = TanhNormal(dist.loc, dist.scale, event_dims=1)
+    for draw in (dist.rsample_and_log_prob, dist.sample_and_log_prob):
+        action, score = draw()
+        expected = unit.log_prob((action - 0.5) / 3.5)
+        for found in (score, dist.log_prob(action)):
+            torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-6)
 
 
 def test_without_the_squash_correction_sac_scores_what_is_squashed():

@@ -151,7 +151,7 @@ def test_every_short_chain_rises_from_1_to_the_top_in_growing_strides(num_levels
 
 
 @pytest.mark.parametrize(
-    "levels", [[], [6], [1, 3], [2, 6], [1, 3, 3, 6], [1, 5, 3, 6], [1, 2.0, 6], [0, 1, 6], [1, 7]]
+    "levels", [[], [6], [1, 3], [2, 6], [1, 3, 3, 6], [1, 5, 3, 6], [1, 2.5, 6], [0, 1, 6], [1, 7]]
 )
 def test_levels_of_ones_own_must_rise_from_1_to_the_top(levels):
     with pytest.raises(ValueError, match=r"rising integers from 1 to 6, .* such as \[1, 2, 3, 6\]"):

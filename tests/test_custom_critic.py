@@ -373,6 +373,21 @@ def test_towers_in_one_sequence_with_keys_of_the_same_name_stay_apart():
     assert all(parameter.grad is not None for parameter in module.parameters())
 
 
+def test_another_module_in_place_of_the_first_is_told():
+    critic = CustomCritic(Network())
+    with pytest.raises(
+        AttributeError, match=r"cannot be replaced: expected CustomCritic\(module\)"
+    ):
+        critic.module = Network()
+
+
+@pytest.mark.parametrize("batch", [(0,), (2, 0)])
+def test_no_states_have_no_values(batch):
+    rows = torch.zeros(*batch, OBS), torch.zeros(*batch, ACTION), torch.zeros(batch).long()
+    for critic in (CustomCritic(Network()), NoiseLevelCritic(OBS, ACTION, num_cells=[8])):
+        assert critic(*rows).shape[:-1] == batch
+
+
 def test_one_key_instead_of_a_list_is_told():
     with pytest.raises(ValueError, match=r"observation_keys as a list of keys, such as .'pixels'."):
         CustomCritic(nn.Linear(3, 1), observation_keys="pixels")

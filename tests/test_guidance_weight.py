@@ -182,6 +182,14 @@ def test_a_copy_moves_its_own_weight_and_its_actor_follows():
     assert clone.guidance_weight != 7
 
 
+@pytest.mark.parametrize("weight", [3.0, torch.tensor(3.0)])
+def test_a_weight_given_to_the_loss_is_the_actors(weight):
+    loss = auto_loss()
+    loss.guidance_weight = weight
+    assert loss.guidance_weight is loss.actor_network.guidance_weight
+    assert loss.guidance_weight == 3
+
+
 def test_compiled_chains_follow_the_weight_without_being_compiled_anew():
     loss, compilations = auto_loss(), []
 

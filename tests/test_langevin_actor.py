@@ -104,3 +104,9 @@ def test_keywords_of_other_chains_are_refused(keyword):
         AnnealedLangevinActor(
             NoiseLevelCritic(3, 2, num_steps=9), VarianceExplodingSchedule(9), **{keyword: None}
         )
+
+
+def test_the_sizes_of_steps_keep_float64_through_casts():
+    actor = make_actor()
+    sizes = actor.step_sizes.clone()
+    assert torch.equal(actor.float().double().step_sizes, sizes)

@@ -302,6 +302,11 @@ def test_qvalue_network_must_be_the_critic_of_the_actor():
         ACALoss(actor, qvalue_network=other.critic)
 
 
+def test_what_is_no_actor_is_told():
+    with pytest.raises(TypeError, match="expects a CriticGuidedDenoisingActor, got NoiseLevelC"):
+        ACALoss(make_actor().critic)
+
+
 def test_qvalue_network_may_be_the_plain_module_that_the_actor_was_built_with():
     class Net(nn.Module):
         def __init__(self):
@@ -323,6 +328,9 @@ def test_qvalue_network_may_be_the_plain_module_that_the_actor_was_built_with():
     [
         ({"noise_level_target": "max"}, "noise_level_target"),
         ({"num_target_candidates": 0}, "num_target_candidates"),
+        ({"loss_function": "huber"}, "loss_function to be one of .* got 'huber'"),
+        ({"reduction": "avg"}, "reduction to be one of .* got 'avg'"),
+        ({"entropy_noise_scale": 0.0}, "entropy_noise_scale > 0"),
     ],
 )
 def test_bad_options_are_refused(kwargs, message):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+
 import gymnasium as gym
 import pytest
 import torch
@@ -153,6 +156,67 @@ def test_the_action_may_have_another_key(key):
     data = env.rollout(4, aca.actor)
     assert data[key].shape == (4, 2)
     assert aca.loss(data)["loss_qvalue"].isfinite()
+
+
+@pytest.mark.parametrize("same_process", [True, False])
+def test_a_copy_is_a_learner_of_its_own(same_process):
+    aca = make_aca(GymEnv("Pendulum-v1"), **SMALL)
+    data = GymEnv("Pendulum-v1").rollout(4, aca.actor)
+    learn(aca, data)  # so that optimisers have moments, and targets are not the online ones
+    clone = copy.deepcopy(aca) if same_process else pickle.loads(pickle.dumps(aca))
+    kept = {name: value.clone() for name, value in aca.loss.state_dict().items()}
+    for name, value in clone.loss.state_dict().items():
+        assert torch.equal(value, kept[name]), name
+    torch.manual_seed(1)
+    learn(clone, data)
+    for name, value in aca.loss.state_dict().items():
+        assert torch.equal(value, kept[name]), name
+    torch.manual_seed(1)
+    learn(aca, data)
+    again, moved = aca.loss.state_dict(), set()
+    for name, value in clone.loss.state_dict().items():
+        assert torch.equal(value, again[name]), name
+        if not value.equal(kept[name]):
+            moved.add(name.split(".")[0])
+    assert {"qvalue_network_params", "target_qvalue_network_params", "log_alpha"} <= moved
+
+
+def learn(aca, data) -> None:
+    losses = aca.loss(data)
+    aca.loss.zero_grad()
+    sum(losses[name] for name in aca.loss.loss_names).backward()
+    aca.optimizer.step()
+    aca.alpha_optimizer.step()
+    aca.target_update.step()
+
+
+def test_reward_and_flags_are_read_where_the_environment_has_them():
+    old = ["reward", "done", "terminated"]
+    new = [("agents", "r"), ("agents", "done"), ("agents", "terminated")]
+    env = TransformedEnv(TwoVectors(), RenameTransform(old, new, [], []))
+    aca = make_aca(env, observation_keys=["position"], **SMALL)
+    keys = aca.loss.tensor_keys
+    assert [keys.reward, keys.done, keys.terminated] == new
+    assert aca.loss(env.rollout(4, aca.actor))["loss_qvalue"].isfinite()
+
+
+def test_one_of_several_actions_is_chosen_by_name():
+    class TwoActions(TwoVectors):
+        def __init__(self):
+            super().__init__()
+            leaf = self.action_spec.clone()
+            self.action_spec = Composite(first=leaf, second=leaf.clone())
+
+    keys = {"observation_keys": ["position"]}
+    with pytest.raises(ValueError, match=r"one action, got \['first', 'second'\]. Pass out_keys"):
+        make_aca(TwoActions(), **keys, **SMALL)
+    aca = make_aca(TwoActions(), out_keys=["second"], **keys, **SMALL)
+    assert aca.actor.out_keys == ["second"]
+
+
+def test_observation_keys_that_are_not_in_a_list_are_told():
+    with pytest.raises(ValueError, match="Expected observation_keys as a list of keys"):
+        make_aca(TwoVectors(), observation_keys="position", **SMALL)
 
 
 def test_an_action_that_is_no_vector_is_told():

@@ -23,8 +23,8 @@ def optimisers(loss: ACALoss) -> tuple[torch.optim.Optimizer, torch.optim.Optimi
     return critic, torch.optim.Adam([loss.log_alpha], lr=3e-2)
 
 
-def trainer_of(loss: ACALoss) -> SimpleNamespace:
-    return SimpleNamespace(loss_module=loss)
+def trainer_of(loss: ACALoss, clip_norm=None, clip_grad_norm=True) -> SimpleNamespace:
+    return SimpleNamespace(loss_module=loss, clip_norm=clip_norm, clip_grad_norm=clip_grad_norm)
 
 
 def test_the_steps_are_those_of_the_official_code_in_its_order():
@@ -78,6 +78,22 @@ def test_a_guidance_weight_that_tunes_itself_moves():
     metrics = stepper.step(trainer_of(loss), make_data(6))
     assert loss.actor_network.guidance_weight != before
     assert metrics["guidance_weight"] == loss.guidance_weight.float()
+
+
+@pytest.mark.parametrize("by_norm", [True, False])
+def test_the_trainers_clip_norm_bounds_each_step(by_norm):
+    torch.manual_seed(0)
+    loss, bound = make_loss(), 1e-3
+    before = [param.detach().clone() for param in loss.qvalue_network.parameters()]
+    critic = torch.optim.SGD(loss.qvalue_network.parameters(), lr=1.0)
+    alpha = torch.optim.SGD([loss.log_alpha], lr=1.0)
+    stepper = ACAOptimizationStepper(critic, alpha)
+    stepper.updates = 1  # an update without a noise-level step
+    stepper.step(trainer_of(loss, bound, by_norm), make_data(6, draws=True))
+    after = loss.qvalue_network.parameters()
+    moved = torch.cat([(a - b).flatten() for a, b in zip(after, before, strict=True)]).abs()
+    size = moved.norm() if by_norm else moved.max()
+    torch.testing.assert_close(size.detach(), torch.tensor(bound), rtol=1e-3, atol=0.0)
 
 
 @pytest.mark.parametrize("name", ["noise_level_interval", "alpha_interval"])

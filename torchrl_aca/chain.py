@@ -71,13 +71,14 @@ def check_levels(levels: Sequence[int], num_levels: int) -> list[int]:
         ValueError: if they are not.
     """
     given = list(levels)
-    rising = all(isinstance(level, int) for level in given) and given == sorted(set(given))
+    whole = [int(level) for level in given]
+    rising = whole == given and whole == sorted(set(whole))
     if len(given) < 2 or not rising or (given[0], given[-1]) != (1, num_levels):
         raise ValueError(
             f"Expected inference_levels as rising integers from 1 to {num_levels}, both included, "
             f"such as [1, 2, 3, {num_levels}]; got {given}."
         )
-    return given
+    return whole
 
 
 # --- the chains -----------------------------------------------------------------------------------

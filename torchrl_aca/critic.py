@@ -112,7 +112,7 @@ class NoiseLevelCriticBase(TensorDictModuleBase):
         action = tensordict[self.action_key]
         batch = action.shape[:-1]
         observations = [tensordict[key] for key in self.observation_keys]
-        rows = [o.reshape(-1, *o.shape[len(batch) :]) for o in observations]
+        rows = [o.reshape(batch.numel(), *o.shape[len(batch) :]) for o in observations]
         level = tensordict[self.noise_level_key].expand(batch).reshape(-1)
         value = self.evaluate(self.encode(*rows), action.reshape(-1, action.shape[-1]), level)
         return tensordict.set(self.value_key, value.reshape(*batch, value.shape[-1]))

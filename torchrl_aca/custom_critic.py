@@ -32,6 +32,9 @@ class CustomCritic(NoiseLevelCriticBase):
     actions are drawn: the chain cannot differentiate through a change of buffers. What becomes of
     buffers in a loss is told at :class:`ACALoss`.
 
+    The parts are taken at construction: to put another one in a part's place, build the critic, the
+    actor and the loss anew.
+
     Args:
         module: the network. A module that ignores the noise level is a plain critic ``Q(s, a)``.
 
@@ -47,6 +50,7 @@ class CustomCritic(NoiseLevelCriticBase):
     Raises:
         ValueError: if the module does not read the action or does not write the value, or
             ``observation_keys`` is one key instead of a list.
+        AttributeError: if another ``module`` is set.
     """
 
     def __init__(
@@ -83,6 +87,14 @@ class CustomCritic(NoiseLevelCriticBase):
         self.__dict__["_head"] = head
         self._feature_keys = [key for key in head.in_keys if key not in row_keys]
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name == "module" and "_head" in self.__dict__:
+            raise AttributeError(
+                "The module of a CustomCritic cannot be replaced: expected CustomCritic(module), "
+                "and an actor and a loss built on that."
+            )
+        super().__setattr__(name, value)
+
     def encode(self, *observations: Tensor) -> TensorDict:
         """What the head reads of ``B`` states, as a TensorDict of batch size ``(B,)``."""
         states = TensorDict(batch_size=observations[0].shape[:1])
@@ -92,8 +104,8 @@ class CustomCritic(NoiseLevelCriticBase):
 
     def _evaluate(self, features: Any, action: Tensor, index: Tensor) -> Tensor:
         batch = action.shape[:-1]
-        rows = features.expand(batch).reshape(-1)
-        rows.set(self.action_key, action.reshape(-1, action.shape[-1]))
+        rows = features.expand(batch).reshape(batch.numel())
+        rows.set(self.action_key, action.reshape(batch.numel(), action.shape[-1]))
         rows.set(self.noise_level_key, index.expand(batch).reshape(-1))
         value = self._head(rows).get(self.value_key)
         if value.ndim != 2:

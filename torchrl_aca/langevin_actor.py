@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -94,6 +94,13 @@ class AnnealedLangevinActor(CriticGuidedDenoisingActor):
         self.register_buffer("step_levels", levels.to(device), persistent=False)
         self.register_buffer("step_sizes", sizes[levels].to(device), persistent=False)
         self._fix_noise(self.fixed_noise, len(levels))
+
+    def _apply(self, fn: Callable, recurse: bool = True) -> AnnealedLangevinActor:
+        """The sizes of steps, numbers like 1e-4, follow device moves and ignore casts."""
+        sizes = self.step_sizes
+        super()._apply(fn, recurse)
+        self._buffers["step_sizes"] = sizes.to(self.step_sizes.device)
+        return self
 
     def _chains(
         self,

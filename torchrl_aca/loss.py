@@ -42,9 +42,11 @@ class ACALoss(OpenLoopAlpha, AutoGuidance, TDLoss):
     computed after the first step: call the methods one by one for that.
 
     The loss holds the very parameters of ``actor_network.critic`` and its ``log_alpha``, so actor,
-    optimiser and collector never need synchronising in one process. Buffers of a critic of one's
-    own, running statistics say, are shared in the same way, through casts and copies; the target
-    critics take over the online buffers as they are, for target updaters move parameters alone.
+    optimiser and collector never need synchronising in one process. (``load_state_dict`` with
+    ``assign=True`` is for the loss; an actor that is loaded so leaves its loss behind.) Buffers of
+    a critic of one's own, running statistics say, are shared in the same way, through casts and
+    copies; the target critics take over the online buffers as they are, for target updaters move
+    parameters alone.
 
     Args:
         actor_network: the actor; its critic is the network that is trained.
@@ -90,6 +92,7 @@ class ACALoss(OpenLoopAlpha, AutoGuidance, TDLoss):
 
     Raises:
         ValueError: on an unknown option, or a ``qvalue_network`` that is not the actor's critic.
+        TypeError: if ``actor_network`` is none.
 
     Examples:
         >>> actor = CriticGuidedDenoisingActor(NoiseLevelCritic(3, 2), NoiseSchedule.cosine(20))
@@ -176,6 +179,11 @@ class ACALoss(OpenLoopAlpha, AutoGuidance, TDLoss):
         use_given_draws: bool = True,
     ) -> None:
         super().__init__()
+        if not isinstance(actor_network, CriticGuidedDenoisingActor):
+            raise TypeError(
+                f"ACALoss expects a CriticGuidedDenoisingActor, got {type(actor_network).__name__}."
+                " Build one on your critic: the actor holds the critic that is trained."
+            )
         critic = actor_network.critic
         if qvalue_network not in (None, critic, getattr(critic, "module", None)):
             raise ValueError(
@@ -187,7 +195,8 @@ class ACALoss(OpenLoopAlpha, AutoGuidance, TDLoss):
             num_target_candidates = actor_network.num_candidates
         check_at_least(1, num_target_candidates=num_target_candidates)
         check_choice(("best", "soft"), target_value=target_value)
-        check_above(0, temperature=temperature)
+        check_above(0, temperature=temperature, entropy_noise_scale=entropy_noise_scale)
+        check_choice(("l1", "l2", "smooth_l1"), loss_function=loss_function)
         # The actor is no submodule: its parameters are listed below, and only once.
         self.__dict__["actor_network"] = actor_network
         self.convert_to_functional(critic, "qvalue_network", create_target_params=delay_qvalue)
@@ -197,7 +206,7 @@ class ACALoss(OpenLoopAlpha, AutoGuidance, TDLoss):
         self.noise_level_target = noise_level_target
         self.reward_scale = reward_scale
         self.loss_function = loss_function
-        self.reduction = reduction or "mean"
+        self._set_reduction(reduction)
         self.use_prioritized_weights = use_prioritized_weights
         self.use_given_draws = use_given_draws
         self._init_alpha(target_entropy, target_entropy_scale, entropy_noise_scale)
@@ -346,6 +355,14 @@ class ACALoss(OpenLoopAlpha, AutoGuidance, TDLoss):
         super()._tie()
         self._tie_alpha()
         self._tie_guidance()
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """A weight given to ``guidance_weight`` goes to the actor, whose buffer it is."""
+        actor = self.__dict__.get("actor_network")
+        if name == "guidance_weight" and actor is not None and value is not actor.guidance_weight:
+            actor.guidance_weight = value
+        else:
+            super().__setattr__(name, value)
 
     def _take_loaded(self) -> None:
         self.actor_network.guidance_weight = self.guidance_weight  # fills the actor's buffer

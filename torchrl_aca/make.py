@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,7 +15,7 @@ from torchrl.envs import EnvBase
 from torchrl.objectives import SoftUpdate
 
 from torchrl_aca.actor import CriticGuidedDenoisingActor
-from torchrl_aca.checks import action_spec, check_choice
+from torchrl_aca.checks import action_spec, check_choice, check_keys
 from torchrl_aca.critic import NoiseLevelCritic
 from torchrl_aca.loss import ACALoss
 from torchrl_aca.schedule import NoiseSchedule
@@ -63,6 +64,7 @@ def make_aca_actor(
         torch.Size([3, 6])
     """
     check_choice(("cosine", "linear", "vp"), schedule=schedule)
+    check_keys(observation_keys=observation_keys)
     action_dim = action_spec(spec, actor.get("out_keys", ["action"])[0], None).shape[-1]
     critic = NoiseLevelCritic(
         observation_dim,
@@ -80,10 +82,10 @@ def make_aca_actor(
 
 @dataclass
 class ACAParts:
-    """What :func:`make_aca` builds.
+    """What :func:`make_aca` builds. A deep copy is a learner of its own.
 
     Attributes:
-        loss: the loss; ``loss.gamma`` is set.
+        loss: the loss; its value estimator has ``gamma``.
         target_update: moves the target parameters.
         optimizer: of the critic.
         alpha_optimizer: of ``loss.log_alpha``.
@@ -98,6 +100,16 @@ class ACAParts:
     def actor(self) -> CriticGuidedDenoisingActor:
         """The policy."""
         return self.loss.actor_network
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> ACAParts:
+        """The updater is built anew, as it keeps tensors of its loss; it begins with a copy."""
+        loss = copy.deepcopy(self.loss, memo)
+        optimizers = copy.deepcopy((self.optimizer, self.alpha_optimizer), memo)
+        targets = loss.target_qvalue_network_params
+        kept = targets.data.clone()
+        updater = SoftUpdate(loss, eps=self.target_update.eps)
+        targets.data.copy_(kept)
+        return ACAParts(loss, updater, *optimizers)
 
 
 def make_aca(
@@ -126,15 +138,18 @@ def make_aca(
         gamma: discount. Default: 0.99.
         tau: step of the target parameters. Default: 0.005.
         lr: learning rate of the critic. Default: 1e-3.
-        alpha_lr: learning rate of ``log_alpha``. Default: 3e-2.
+        alpha_lr: learning rate of ``log_alpha``. Default: 3e-2, which is for a step at every 250th
+            update, as in the official code: exploration noise is then at its lowest after 30,000
+            updates, and after 120 with a step at each.
         make_optimizer: called as ``make_optimizer(parameters, lr=...)``. Default: Adam.
         device: device of the parameters. Default: the environment's.
         actor: other keywords of :func:`make_aca_actor` and of the actor; ``out_keys`` is by default
-            the environment's action key.
+            the environment's action key. Where it has one reward, done or terminated flag, the loss
+            reads that; else tell it by ``loss.set_keys``.
 
     Raises:
-        ValueError: if ``env`` has no such observations or no bounded vector as action, or one of
-            the parts refuses a value.
+        ValueError: if ``env`` has no such observations, several actions or no bounded vector as
+            action, or one of the parts refuses a value.
         TypeError: if ``env`` is no TorchRL environment.
 
     Examples:
@@ -148,6 +163,11 @@ def make_aca(
             f"make_aca expects a TorchRL environment, got {type(env).__name__}. Wrap it, as in "
             "torchrl.envs.GymWrapper(env)."
         )
+    if len(env.action_keys) > 1 and "out_keys" not in actor:
+        raise ValueError(
+            f"Expected an environment with one action, got {env.action_keys}. Pass out_keys=[...] "
+            "with the one that ACA is to choose, and let another policy choose the others."
+        )
     device = env.device if device is None else device
     network = make_aca_actor(
         _observation_dim(env, observation_keys),
@@ -158,6 +178,7 @@ def make_aca(
     )
     module = ACALoss(network, num_target_candidates=num_target_candidates, **(loss or {}))
     module.make_value_estimator(gamma=gamma)
+    module.set_keys(**_reward_keys(env))
     return ACAParts(
         module,
         SoftUpdate(module, tau=tau),
@@ -166,8 +187,17 @@ def make_aca(
     )
 
 
+def _reward_keys(env: EnvBase) -> dict[str, NestedKey]:
+    """Keys of reward, done and terminated, each where the environment has one alone."""
+    found = {"reward": list(env.reward_keys)}
+    for name in ("done", "terminated"):
+        found[name] = [key for key in env.done_keys if name in (key, key[-1])]
+    return {name: keys[0] for name, keys in found.items() if len(keys) == 1}
+
+
 def _observation_dim(env: EnvBase, keys: Sequence[NestedKey]) -> int:
     """The numbers in the observations of one environment."""
+    check_keys(observation_keys=keys)
     spec = env.full_observation_spec_unbatched
     known = list(spec.keys(True, True))
     for key in keys:

@@ -14,6 +14,8 @@ from torch import Tensor, nn
 from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.utils import dispatch_value_estimator
 
+from torchrl_aca.checks import check_choice
+
 __all__ = ["TDLoss", "next_key"]
 
 
@@ -56,6 +58,11 @@ class TDLoss(LossModule):
     def _row_keys(self) -> list[NestedKey]:
         """Keys of what a loss reads in a row besides the transition."""
         return []
+
+    def _set_reduction(self, reduction: str | None) -> None:
+        """Keep how errors become a loss; None is the mean."""
+        self.reduction = reduction or "mean"
+        check_choice(("none", "mean", "sum"), reduction=self.reduction)
 
     @contextmanager
     def _critics(self, params: TensorDictBase) -> Iterator[Any]:
@@ -154,11 +161,13 @@ class TDLoss(LossModule):
         self._tie()
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Any:
-        """A copy of its own whose parts hold the same parameters."""
+        """A copy of its own whose parts hold the same parameters, as do optimisers copied along."""
         clone = self.__class__.__new__(self.__class__)
         memo[id(self)] = clone
         clone.__dict__.update(copy.deepcopy(self.__dict__, memo))
         clone._tie()
+        for old, new in zip(self.parameters(), clone.parameters(), strict=True):
+            memo[id(old)] = new
         return clone
 
     def __setstate__(self, state: dict[str, Any]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from tensordict import TensorDict, TensorDictBase
+from torch.nn.utils import clip_grad_norm_, clip_grad_value_
 from torch.optim import Optimizer
 from torchrl.trainers import OptimizationStepper, Trainer
 
@@ -18,7 +19,8 @@ class ACAOptimizationStepper(OptimizationStepper):
 
     A TD step, and one of a guidance weight that tunes itself; at even updates a step of the same
     optimiser on the noise-level loss, at the parameters after the first; at every 250th a step on
-    alpha. The trainer's own ``target_net_updater`` moves the targets after each update.
+    alpha. The trainer's ``clip_norm`` clips each step's gradients by their norm, or by value with
+    ``clip_grad_norm=False``; its ``target_net_updater`` moves the targets after each update.
 
     Args:
         critic_optimizer: of the critic's parameters.
@@ -64,22 +66,30 @@ class ACAOptimizationStepper(OptimizationStepper):
             updates, and wants the same names from each.
         """
         loss = trainer.loss_module
-        self._descend("qvalue", loss.qvalue_loss(sub_batch), self.critic_optimizer)
+        self._descend(trainer, "qvalue", loss.qvalue_loss(sub_batch), self.critic_optimizer)
         if loss.auto_guidance:
             self._latest["guidance_weight"] = loss.step_guidance_weight(sub_batch)
         if self.updates % self.noise_level_interval == 0:
-            self._descend("noise_level", loss.noise_level_loss(sub_batch), self.critic_optimizer)
+            losses = loss.noise_level_loss(sub_batch)
+            self._descend(trainer, "noise_level", losses, self.critic_optimizer)
         if self.updates % self.alpha_interval == 0:
-            self._descend("alpha", loss.alpha_loss(), self.alpha_optimizer)
+            self._descend(trainer, "alpha", loss.alpha_loss(), self.alpha_optimizer)
         self.updates += 1
         metrics = TensorDict({}, batch_size=[])
         for losses in self._latest.values():
             metrics.update(losses)
         return metrics
 
-    def _descend(self, name: str, losses: TensorDictBase, optimizer: Optimizer) -> None:
+    def _descend(
+        self, trainer: Trainer, name: str, losses: TensorDictBase, optimizer: Optimizer
+    ) -> None:
         optimizer.zero_grad()
         losses[f"loss_{name}"].backward()
+        if trainer.clip_norm is not None:
+            clip = clip_grad_norm_ if trainer.clip_grad_norm else clip_grad_value_
+            clip(
+                [p for group in optimizer.param_groups for p in group["params"]], trainer.clip_norm
+            )
         optimizer.step()
         self._latest[name] = losses.detach()
 

@@ -8,7 +8,6 @@ from typing import Any
 import torch
 from pydantic import model_validator
 from tensordict import TensorDict, TensorDictBase
-from torchrl.data import Bounded
 from torchrl.envs import EnvBase
 from torchrl.modules import ProbabilisticActor, ValueOperator
 from torchrl.objectives import SACLoss, SoftUpdate
@@ -54,6 +53,7 @@ def make_sac(cfg: Any, env: EnvBase, device: torch.device) -> Agent:
         log_std_min=cfg.sac.log_std_min,
         log_std_max=cfg.sac.log_std_max,
         squash_correction=cfg.sac.squash_correction,
+        rescaled=True,
     )
     policy, optim = builder.build(device), cfg.optim
     loss = make_loss(cfg, policy, builder, device)
@@ -87,15 +87,12 @@ def make_loss(
         ValueOperator(make_mlp(num_in, 1, **mlp, device=device), in_keys=["observation", "action"])
         for _ in range(2)
     ]
-    target_entropy = -settings.target_entropy_scale * action_dim
-    if settings.squash_correction:  # the density is of actions in env units; the target is not
-        target_entropy += log_half_range(builder.spec)
     loss = SACLoss(
         policy,
         critics,
         loss_function="l2",
         alpha_init=settings.alpha_init,
-        target_entropy=target_entropy,
+        target_entropy=-settings.target_entropy_scale * action_dim,
     ).to(device)
     loss.make_value_estimator(gamma=cfg.optim.gamma)
     return loss
@@ -123,8 +120,3 @@ def policy_loss(loss: SACLoss, batch: TensorDictBase) -> TensorDict:
         alpha=loss.log_alpha.detach().exp(),
         entropy=-log_prob.mean(),
     )
-
-
-def log_half_range(action_spec: Bounded) -> float:
-    """Returns what the entropy in env units is above that of the same actions in [-1, 1]."""
-    return ((action_spec.space.high - action_spec.space.low) / 2).log().sum().item()

@@ -48,7 +48,8 @@ class EnsembleCQLLoss(EnsembleSACLoss):
     - :meth:`actor_loss` and :meth:`alpha_loss` as in the parent.
 
     Densities are of actions rescaled to [-1, 1], as everywhere in the parent: ``log mu`` of a
-    uniform action is ``-A log 2``. No gradient of ``gap`` reaches the policy.
+    uniform action is ``-A log 2``. No gradient of ``gap`` reaches the policy. As ``U`` has actions
+    of ``pi(.|s')``, terminal states must be finite too, where other losses ignore what they hold.
 
     Only the members in ``M'`` are evaluated at the ``3 n`` actions. WSRL's code evaluates all and
     then takes these: the same loss at a fifth of the cost.

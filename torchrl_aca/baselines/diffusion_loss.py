@@ -138,7 +138,7 @@ class DiffusionPolicyLoss(TDLoss):
             self._tie()
         self.num_target_candidates = num_target_candidates
         self.reward_scale = reward_scale
-        self.reduction = reduction or "mean"
+        self._set_reduction(reduction)
         self.use_prioritized_weights = use_prioritized_weights
         self.use_given_draws = use_given_draws
         self.set_keys(action=actor_network.out_keys[0])

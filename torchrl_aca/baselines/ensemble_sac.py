@@ -54,7 +54,10 @@ class EnsembleSACLoss(EnsembleTDLoss):
     has separate losses, but takes the minimum over all critics.
 
     Log-probabilities are those of the action rescaled to [-1, 1], as in RLPD, which rescales its
-    environments: so target entropy and temperature mean the same whatever the action's range.
+    environments: so target entropy and temperature mean the same whatever the action's range. The
+    actor tells the range by a bounded spec; without one, they are those of the action itself.
+
+    No priority is written, and importance weights are not read.
 
     Args:
         actor_network: the policy. Its distribution must have ``rsample``.
@@ -154,7 +157,7 @@ class EnsembleSACLoss(EnsembleTDLoss):
         self.actor_value = actor_value
         self.entropy_backup = entropy_backup
         self.temperature = temperature
-        self.reduction = reduction or "mean"
+        self._set_reduction(reduction)
         self._init_entropy(alpha_init, target_entropy, target_entropy_scale)
 
     def _init_entropy(self, alpha_init: float, target: float | str, scale: float) -> None:

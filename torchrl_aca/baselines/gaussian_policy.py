@@ -52,6 +52,31 @@ class UncorrectedTanhNormal(TanhNormal):
         return self.base_dist.log_prob(self.transforms[0].inv(value))
 
 
+class RescaledTanhNormal(TanhNormal):
+    """A squashed Gaussian that scores an action by the density of that action rescaled to [-1, 1].
+
+    So entropies do not depend on the units of the actions, and are what target entropies mean.
+    """
+
+    def rsample_and_log_prob(self, sample_shape: Sequence[int] = ()) -> tuple[Tensor, Tensor]:
+        """Returns actions with a gradient, and their scores."""
+        action, log_prob = super().rsample_and_log_prob(torch.Size(sample_shape))
+        return action, log_prob + self._log_half_range
+
+    def sample_and_log_prob(self, sample_shape: Sequence[int] = ()) -> tuple[Tensor, Tensor]:
+        """Returns actions without a gradient, and their scores."""
+        action, log_prob = super().sample_and_log_prob(torch.Size(sample_shape))
+        return action, log_prob + self._log_half_range
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Returns the scores of any actions."""
+        return super().log_prob(value) + self._log_half_range
+
+    @property
+    def _log_half_range(self) -> Tensor:
+        return ((self.high - self.low) / 2).log().sum(-1)
+
+
 class FreeStd(nn.Module):
     """Puts a mean in [-1, 1] into env units, beside a standard deviation that no state changes."""
 
@@ -114,6 +139,7 @@ def make_gaussian_policy(
     log_std_min: float = -20.0,
     log_std_max: float = 2.0,
     squash_correction: bool = True,
+    rescaled: bool = False,
     device: torch.device | str | None = None,
     **mlp: Any,
 ) -> ProbabilisticActor:
@@ -128,6 +154,8 @@ def make_gaussian_policy(
         log_std_max: upper bound. Default: 2.
         squash_correction: the log-probability is of the action. False: of what was squashed, as in
             the code base of the comparison in ACA's paper. Default: True.
+        rescaled: the log-probability is of the action rescaled to [-1, 1], for losses that do not
+            rescale themselves, such as TorchRL's ``SACLoss``. Default: False.
         device: device of the parameters.
         mlp: keywords of :func:`make_mlp`.
 
@@ -139,6 +167,7 @@ def make_gaussian_policy(
         torch.Size([3, 6])
     """
     spec = spec.to(device)
+    corrected = RescaledTanhNormal if rescaled else TanhNormal
     network = nn.Sequential(
         make_mlp(observation_dim, 2 * spec.shape[-1], device=device, **mlp),
         BoundedNormalParams(log_std_min, log_std_max),
@@ -147,7 +176,7 @@ def make_gaussian_policy(
         TensorDictModule(network, in_keys=["observation"], out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
         spec=spec,
-        distribution_class=TanhNormal if squash_correction else UncorrectedTanhNormal,
+        distribution_class=corrected if squash_correction else UncorrectedTanhNormal,
         distribution_kwargs={"low": spec.space.low, "high": spec.space.high},
     )
 

@@ -34,8 +34,9 @@ class EnsembleIQLLoss(EnsembleTDLoss):
       its own.
 
     It is TorchRL's ``IQLLoss`` with targets from a few members, as in the code of WSRL's authors
-    (arXiv 2412.07762) with ten critics; with ``subset_size=E`` the two have the same values and
-    gradients. A subclass of it would evaluate all ten target critics for each of two minima, and
+    (arXiv 2412.07762) with ten critics; with ``subset_size=E`` and without replacement the two
+    have the same values and gradients, but that the critics' loss is a mean over members here and a
+    sum there. A subclass of it would evaluate all ten target critics for each of two minima, and
     has no ``none`` reduction of the metrics that the other losses here have.
 
     Args:
@@ -123,7 +124,7 @@ class EnsembleIQLLoss(EnsembleTDLoss):
         self._set_networks(actor_network, qvalue_network, subset_size, subset_with_replacement)
         self.value_network = value_network
         self.expectile, self.temperature, self.max_weight = expectile, temperature, max_weight
-        self.reduction = reduction or "mean"
+        self._set_reduction(reduction)
 
     # --- the three losses -------------------------------------------------------------------------
 
