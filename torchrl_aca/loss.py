@@ -92,7 +92,7 @@ class ACALoss(OpenLoopAlpha, AutoGuidance, TDLoss):
 
     Raises:
         ValueError: on an unknown option, or a ``qvalue_network`` that is not the actor's critic.
-        TypeError: if ``actor_network`` is none.
+        TypeError: if ``actor_network`` is no such actor.
 
     Examples:
         >>> actor = CriticGuidedDenoisingActor(NoiseLevelCritic(3, 2), NoiseSchedule.cosine(20))
@@ -179,7 +179,7 @@ class ACALoss(OpenLoopAlpha, AutoGuidance, TDLoss):
         use_given_draws: bool = True,
     ) -> None:
         super().__init__()
-        if not isinstance(actor_network, CriticGuidedDenoisingActor):
+        if not isinstance(getattr(actor_network, "critic", None), NoiseLevelCriticBase):
             raise TypeError(
                 f"ACALoss expects a CriticGuidedDenoisingActor, got {type(actor_network).__name__}."
                 " Build one on your critic: the actor holds the critic that is trained."
