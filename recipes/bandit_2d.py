@@ -95,8 +95,9 @@ def compare(cfg: BanditConfig, run_dir: Path) -> None:
         reported += rows
         swept += sweep_rows
         actors.setdefault(method, pickle.loads(actor))
+        tables.write_csv(run_dir / "seeds.csv", reported)  # as they come: they take minutes each
     table = tables.summary(reported)
-    for name, rows in (("seeds", reported), ("sweep", swept), ("table", table)):
+    for name, rows in (("sweep", swept), ("table", table)):
         if rows:
             tables.write_csv(run_dir / f"{name}.csv", rows)
     print(tables.as_text(table))
@@ -112,7 +113,7 @@ def ablate(cfg: BanditConfig, run_dir: Path) -> None:
     table = []
     for changed, (rows, *_) in zip(settings, run_all(tasks, cfg.num_workers), strict=True):
         table += [{**changed, **row} for row in rows]
-    tables.write_csv(run_dir / "ablation.csv", table)
+        tables.write_csv(run_dir / "ablation.csv", table)
     compact = tables.side_by_side(table, [*cfg.ablation.training, *cfg.ablation.samplings()[0]])
     tables.write_csv(run_dir / "ablation_table.csv", compact)
     print(tables.as_text(compact))

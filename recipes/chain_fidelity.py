@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import itertools
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -162,14 +163,13 @@ def measure_borders(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 
 def write(rows: Iterator[dict[str, Any]], path: Path) -> list[dict[str, Any]]:
-    """Writes each row as it comes, so that an interrupt loses none."""
+    """Writes each row as it comes: an interrupt loses none, and no row leaves the old table."""
+    first, written = next(rows), []
     path.parent.mkdir(parents=True, exist_ok=True)
-    written = []
     with open(path, "w", newline="") as file:
-        for row in rows:
-            if not written:
-                writer = csv.DictWriter(file, row.keys())
-                writer.writeheader()
+        writer = csv.DictWriter(file, first.keys())
+        writer.writeheader()
+        for row in itertools.chain([first], rows):
             writer.writerow({k: round(v, 5) if isinstance(v, float) else v for k, v in row.items()})
             file.flush()
             written.append(row)

@@ -61,8 +61,8 @@ def evaluate_runs(cfg: EvaluateConfig) -> list[dict[str, Any]]:
     rows = []
     for run_dir, content in stored.items():
         for row in evaluate_run(cfg, content, device):
+            print(f"{run_dir}, {told(row)}", flush=True)  # first: it may not be ours to write there
             add_row(run_dir, row)
-            print(f"{run_dir}, {told(row)}")
             rows.append(row)
     if cfg.video:
         for run_dir, content in stored.items():

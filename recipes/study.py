@@ -21,6 +21,7 @@ from studies.launchers import launch_jobs
 from studies.status import last_line, state_of, status_table
 from torchrl_aca.errors import DatasetError, RunError
 from torchrl_aca.training.config import checked
+from torchrl_aca.training.progress import say
 from torchrl_aca.training.signals import STOPPED, StopSignal
 
 
@@ -35,16 +36,16 @@ def run(cfg: StudyConfig) -> int:
     if cfg.study.recipe == "o2o_halfcheetah":
         for job in open_jobs:  # here, as two jobs would make the same data at the same time
             prepare_data(job.config)
-    print(f"{study_dir(cfg)}: {len(open_jobs)} of {len(jobs)} jobs to do", flush=True)
+    say(f"{study_dir(cfg)}: {len(open_jobs)} of {len(jobs)} jobs to do")
     failed = 0
     with StopSignal() as stop:
         stop.activity = "iteration of each job"
         for job, code in launch_jobs(cfg, open_jobs, stop):
             outcome = {0: "done", STOPPED: "stopped"}.get(code, f"failed with status {code}")
             why = f": {last_line(job)}" if code else ""
-            print(f"{job.dir.name} {outcome}{why}", flush=True)
+            say(f"{job.dir.name} {outcome}{why}")
             failed += code not in (0, STOPPED)
-    print(status_table(jobs).splitlines()[-1])
+    say(status_table(jobs).splitlines()[-1])
     if stop.received:
         raise SystemExit(STOPPED)
     return failed

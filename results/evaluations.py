@@ -37,6 +37,7 @@ COLUMNS = [
     "parameters",
     "commit",
 ]
+NEEDED = ("method", "task", "seed", "updates", "return_mean")
 Row = dict[str, Any]
 Scores = dict[str, list[np.ndarray]]  # of each method, for each task
 
@@ -92,7 +93,7 @@ def read_study(source: Path) -> list[Row]:
     task, method and seed are an error: settings that differ need methods of their own.
     """
     if source.suffix == ".csv":
-        return [dict.fromkeys(COLUMNS, "") | row for row in read_csv(source)]
+        return [dict.fromkeys(COLUMNS, "") | row for row in _read_table(source)]
     found: dict[Any, tuple[Path, list[Row]]] = {}
     for path in sorted(source.rglob("eval.csv")):
         for key, rows in by_run(read_run(path.parent)).items():
@@ -106,6 +107,18 @@ def read_study(source: Path) -> list[Row]:
     if not found:
         raise SystemExit(f"error: {source}: expected directories of runs that have begun to train.")
     return [row for _, rows in found.values() for row in rows]
+
+
+def _read_table(source: Path) -> list[Row]:
+    """The rows of a study's CSV; that of evaluate.py has the same name and is another one."""
+    rows = read_csv(source) if source.is_file() else []
+    if not rows or (missing := [name for name in NEEDED if name not in rows[0]]):
+        found = f"none of {missing}" if rows else "no rows"
+        raise SystemExit(
+            f"error: {source}: expected the evaluations.csv of a study, found {found}. Give the "
+            "table that report.py has written, or a folder of runs."
+        )
+    return rows
 
 
 def read_studies(sources: Sequence[Path]) -> list[Row]:

@@ -27,7 +27,8 @@ from omegaconf import OmegaConf
 from curves import draw_marks, draw_mean, make_panels, shared
 from evaluations import read_evaluations
 
-OWN_KEYS = ("seed", "run_dir", "resume", "logger", "checkpoint", "video")  # not what a run is
+# Not what a run is.
+OWN_KEYS = ("seed", "run_dir", "resume", "existing", "logger", "checkpoint", "video")
 
 
 @dataclass(frozen=True)

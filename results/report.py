@@ -99,6 +99,10 @@ def task_table(rows: Sequence[Row], places: Sequence[float], unit: str, beside: 
                     for m, v in zip(methods, values, strict=True)
                 ]
                 lines.append(["*paper*", *theirs])
+    if not lines:
+        raise SystemExit(
+            f"error: no run was evaluated at {list(places)} {unit}. Compare elsewhere with --at."
+        )
     return markdown(["", *methods], lines)
 
 
@@ -119,8 +123,11 @@ def runs_table(rows: Sequence[Row]) -> str:
         offline = max(0, -first["updates"])
         updates = f"{offline:,.0f} + {row['updates']:,.0f}" if offline else f"{row['updates']:,.0f}"
         minutes = f"{row['seconds'] / 60:.0f}" if row["seconds"] != "" else ""
-        made = number(row["return_mean"]) + " ± " + number(row["return_std"], row["return_mean"])
-        counts = [f"{row['seed']:.0f}", updates, f"{row['frames']:,.0f}", made, minutes]
+        frames = f"{row['frames']:,.0f}" if row["frames"] != "" else ""
+        made = number(row["return_mean"])
+        if row["return_std"] != "":
+            made += " ± " + number(row["return_std"], row["return_mean"])
+        counts = [f"{row['seed']:.0f}", updates, frames, made, minutes]
         lines.append([row["task"], row["method"], *counts, row["commit"][:7]])
     header = ["task", "method", "seed", "updates", "frames", "return", "minutes", "commit"]
     return markdown(header, lines)
@@ -195,7 +202,7 @@ def command(out: Path, args: argparse.Namespace) -> str:
     words = ["python", "results/report.py", str(out / "evaluations.csv"), str(out)]
     words += ["--x", args.x] * (args.x != "updates")
     words += ["--value", args.value] * (args.value != "return_mean")
-    words += ["--at", *(f"{place:g}" for place in args.at)] * bool(args.at)
+    words += ["--at", *(f"{place:.15g}" for place in args.at)] * bool(args.at)
     words += [word for line in args.line for word in ("--line", line)]
     return shlex.join(words)
 
@@ -213,7 +220,12 @@ def parse_lines(texts: Sequence[str]) -> Lines:
     for text in texts:
         task, _, rest = text.partition(":")
         name, _, value = rest.partition("=")
-        lines.setdefault(task, {})[name] = float(value)
+        try:
+            lines.setdefault(task, {})[name] = float(value)
+        except ValueError:
+            raise SystemExit(
+                f"error: --line {text!r}: expected TASK:NAME=VALUE with a number."
+            ) from None
     return lines
 
 

@@ -148,3 +148,10 @@ def test_a_method_without_a_guided_chain_is_told(tmp_path):
     train(composed(*TINY["sac"], f"run_dir={run_dir}"))
     with pytest.raises(SystemExit, match="algo=sac has no chain to shorten"):
         chain_fidelity.main([str(run_dir), "--out", str(tmp_path / "out")])
+
+
+def test_a_wrong_path_leaves_the_tables_of_before(tmp_path):
+    (tmp_path / "border.csv").write_text("old")
+    with pytest.raises(SystemExit, match="error: .*expected a run directory with checkpoints"):
+        chain_fidelity.main([str(tmp_path / "nowhere"), "--out", str(tmp_path)])
+    assert (tmp_path / "border.csv").read_text() == "old"

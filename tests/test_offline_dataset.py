@@ -118,6 +118,18 @@ def test_an_error_while_writing_leaves_nothing(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_full_disk_leaves_nothing(tmp_path):
+    def fail():
+        raise OSError(28, "No space left on device")
+
+    with (
+        pytest.raises(OSError, match="No space left"),
+        DatasetWriter(tmp_path / "data", OBSERVATION_DIM, ACTION_DIM) as writer,
+    ):
+        writer._open.callback(fail)  # where rows that were held back are written
+    assert not list(tmp_path.iterdir())
+
+
 def test_what_a_killed_writer_left_does_not_load_and_is_replaced(tmp_path):
     path = tmp_path / "data"
     killed = DatasetWriter(path, OBSERVATION_DIM, ACTION_DIM)

@@ -138,6 +138,21 @@ def test_ctrl_c_leaves_a_checkpoint_that_resumes(unbroken, tmp_path):
     assert int(rows_of(here / "eval.csv")[-1]["updates"]) == last
 
 
+def test_ctrl_c_leaves_a_checkpoint_where_nobody_reads_the_output(tmp_path, monkeypatch):
+    """As in `... | tee log`, which Ctrl-C ends first."""
+    monkeypatch.delenv("PYTHONUNBUFFERED", raising=False)
+    settings = ["optim.total_updates=100000", "checkpoint.interval=100000", "run_dir=here"]
+    process = start(*TINY_SAC, *settings, cwd=tmp_path)
+    here, deadline = tmp_path / "here", time.time() + 60
+    while not (here / "metrics.csv").exists() and time.time() < deadline:
+        time.sleep(0.05)
+    process.stdout.close()
+    process.send_signal(signal.SIGINT)
+    errors = process.stderr.read()
+    assert (process.wait(timeout=60), errors) == (STOPPED, "")
+    assert int(list_checkpoints(here / "checkpoints")[-1].stem[-10:]) > 0
+
+
 def test_a_second_ctrl_c_ends_the_run_at_once(tmp_path):
     process = start(*TINY_SAC, "env=halfcheetah", "eval.episodes=20", "run_dir=here", cwd=tmp_path)
     lines = iter(process.stdout.readline, "")

@@ -190,6 +190,14 @@ def test_small_returns_have_a_decimal_in_the_list_of_runs(tmp_path):
     assert "| Hopper-v4 | aca | 0 | 100 | 500 | -10.0 ± 1.0 | " in printed
 
 
+def test_a_table_without_frames_or_spread_is_reported_without(tmp_path):
+    table = tmp_path / "mine.csv"
+    table.write_text("method,task,seed,updates,return_mean\naca,Ant-v4,0,0,1\naca,Ant-v4,0,5,900\n")
+    call = [sys.executable, str(SCRIPT), str(table), str(tmp_path / "out")]
+    printed = subprocess.run(call, capture_output=True, text=True, check=True).stdout
+    assert "| Ant-v4 | aca | 0 | 5 |  | 900 |  |  |" in printed
+
+
 def test_scores_are_on_the_scale_of_their_task(study):
     tasks, found = evaluations.scores(rows_of(study), None)
     assert tasks == ["Hopper-v4"]
@@ -232,7 +240,11 @@ def test_half_a_row_of_a_run_at_work_is_none(tmp_path):
     [
         ("apart", [], "the runs of Hopper-v4 have no evaluation at the same place"),
         ("study", ["--value", "normalized_score"], "no evaluation has a normalized_score"),
+        ("study", ["--at", "7"], "no run was evaluated at [7.0] updates"),
+        ("study", ["--line", "foo"], "--line 'foo': expected TASK:NAME=VALUE"),
         ("text.csv", [], "expected a number in column note, got 'good'"),
+        ("policy.csv", [], "expected the evaluations.csv of a study, found none of ['method',"),
+        ("missing.csv", [], "expected the evaluations.csv of a study, found no rows"),
     ],
 )
 def test_what_cannot_be_reported_is_told_and_nothing_is_written(
@@ -243,6 +255,7 @@ def test_what_cannot_be_reported_is_told_and_nothing_is_written(
     (tmp_path / "text.csv").write_text(
         "method,task,seed,updates,return_mean,note\naca,Hopper-v4,0,0,1,good\n"
     )
+    (tmp_path / "policy.csv").write_text("checkpoint,return_mean\n3000,3\n")
     call = [sys.executable, str(SCRIPT), str(tmp_path / source), str(tmp_path / "out"), *options]
     done = subprocess.run(call, capture_output=True, text=True)
     assert done.returncode == 1 and told in done.stderr and "Traceback" not in done.stderr

@@ -15,7 +15,7 @@ from hydra import initialize_config_dir
 
 from recipe_cases import CONFIGS, ROOT, TINY, composed, rows_of, run, start
 from studies.jobs import Job, StudyConfig, make_jobs, write_study
-from studies.status import State, left_seconds, state_of, summary
+from studies.status import State, last_line, left_seconds, state_of, summary
 from torchrl_aca.errors import RunError
 from torchrl_aca.training.config import checked
 from torchrl_aca.training.run_dir import lock
@@ -98,6 +98,32 @@ def test_every_study_of_the_package_is_a_valid_one(study, path):
 def test_a_mistake_in_any_job_is_told_before_the_first_one_starts(study, override, message):
     with pytest.raises(RunError, match=message):
         study("study=tiny", override)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "name"),
+    [
+        (["study.seeds=[0,0]"], "aca-s0"),
+        (
+            [
+                '+study.tasks.InvertedPendulum-v4-x=["env=inverted_pendulum"]',
+                '+study.methods.x-sac=["algo=sac"]',
+            ],
+            "InvertedPendulum-v4-x-sac-s0",
+        ),
+    ],
+)
+def test_two_jobs_of_one_directory_are_told(study, overrides, name):
+    with pytest.raises(RunError, match=f"2 jobs are named .*{name}; expected a directory for each"):
+        study("study=tiny", *overrides)
+
+
+def test_the_line_that_is_told_of_a_job_is_the_one_that_says_why(study, tmp_path):
+    job = study("study=tiny", f"dir={tmp_path}")[0]
+    job.dir.mkdir(parents=True)
+    hint = "Set the environment variable HYDRA_FULL_ERROR=1 for a complete stack trace."
+    job.output.write_text(f"  warnings.warn('x')\nValueError: it exploded\n\n{hint}\n  source\n")
+    assert last_line(job) == "ValueError: it exploded"
 
 
 def test_a_part_of_a_study_leaves_the_names_of_the_rest(tmp_path):

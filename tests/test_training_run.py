@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import csv
+import io
 import os
 import signal
+import sys
+import tempfile
+import time
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import pytest
 import torch
+from filelock import FileLock
 from tensordict import TensorDict
 
 from torchrl_aca.errors import RunError
@@ -25,7 +31,7 @@ from torchrl_aca.training.files import replace_file, write_text
 from torchrl_aca.training.logging import CsvTable, MetricMeans, _wandb_id
 from torchrl_aca.training.randomness import RandomState, seed_everything
 from torchrl_aca.training.resume import is_finished, read_evaluations
-from torchrl_aca.training.run_dir import lock, make_run_dir, require_newest
+from torchrl_aca.training.run_dir import is_locked, lock, make_run_dir, require_newest
 from torchrl_aca.training.signals import STOPPED, StopSignal, run_command
 
 
@@ -214,6 +220,50 @@ def test_a_full_disk_leaves_the_file_that_was_there(tmp_path):
     with pytest.raises(OSError, match="disk full"):
         replace_file(path, crash)
     assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]  # and the room is free again
+
+
+@pytest.mark.parametrize("fault", [BrokenPipeError(), OSError(28, "full"), RuntimeError("again")])
+def test_a_line_that_nobody_can_read_is_lost_alone(fault, monkeypatch):
+    class Reader(io.TextIOWrapper):
+        def write(self, text):
+            raise fault
+
+    with open(os.devnull, "wb") as stream:
+        monkeypatch.setattr(sys, "stdout", Reader(stream))
+        with StopSignal() as stop:
+            os.kill(os.getpid(), signal.SIGTERM)
+        assert stop.received == "SIGTERM"
+        monkeypatch.undo()
+
+
+def test_a_directory_for_reading_alone_is_told_and_its_run_is_not_at_work(tmp_path, monkeypatch):
+    lock(tmp_path).release()
+    (tmp_path / ".lock").touch()
+
+    def refuse(*args, **kwargs):
+        raise OSError(30, "Read-only file system")
+
+    monkeypatch.setattr(FileLock, "acquire", refuse)
+    with pytest.raises(RunError, match="cannot be written: .*Read-only file system. Mend that."):
+        lock(tmp_path)
+    assert not is_locked(tmp_path)
+
+
+def test_a_second_wish_to_stop_ends_a_command_that_still_saves():
+    """It needs SIGTERM twice, as a run in the middle of an evaluation does."""
+    stop = StopSignal()
+    script = "import signal, time; signal.signal(15, lambda *a: signal.signal(15, signal.SIG_DFL))"
+    command = [sys.executable, "-c", f"{script}; print('ready', flush=True); time.sleep(60)"]
+    with tempfile.TemporaryFile() as output, ThreadPoolExecutor(1) as pool:
+        code = pool.submit(run_command, command, stop, stdout=output)
+        while not os.fstat(output.fileno()).st_size:
+            time.sleep(0.02)
+        stop.received = "SIGINT"
+        time.sleep(1)
+        assert not code.done()
+        stop.at_once = True
+        assert code.result(timeout=30) in (-signal.SIGTERM, STOPPED)
 
 
 def test_a_kill_while_a_table_is_rewritten_loses_no_row(tmp_path, monkeypatch):

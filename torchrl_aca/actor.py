@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from typing import Any, Literal
 
@@ -21,12 +21,13 @@ from torchrl_aca.chain_policy import ChainPolicy
 from torchrl_aca.checks import check_above, check_at_least, check_choice, first_parameter
 from torchrl_aca.critic import NoiseLevelCriticBase
 from torchrl_aca.custom_critic import as_noise_level_critic
+from torchrl_aca.exact import ExactBuffers
 from torchrl_aca.schedule import NoiseSchedule, VarianceExplodingSchedule
 
 __all__ = ["CriticGuidedDenoisingActor"]
 
 
-class CriticGuidedDenoisingActor(ChainPolicy):
+class CriticGuidedDenoisingActor(ExactBuffers, ChainPolicy):
     """Samples actions by denoising Gaussian noise along the critic's gradient (Definition 1).
 
     For each state, ``num_candidates`` chains run from ``a_T ~ N(0, I)`` to ``a_0``; the candidate
@@ -178,12 +179,9 @@ class CriticGuidedDenoisingActor(ChainPolicy):
         else:
             super().__setattr__(name, value)
 
-    def _apply(self, fn: Callable, recurse: bool = True) -> CriticGuidedDenoisingActor:
-        """The guidance weight follows device moves, not casts: as a float, it is float64."""
-        weight = self.guidance_weight
-        super()._apply(fn, recurse)
-        self._buffers["guidance_weight"] = weight.to(self.guidance_weight.device)
-        return self
+    def exact_buffers(self) -> Iterable[str]:
+        """The guidance weight: as a float, it is float64."""
+        return ("guidance_weight",)
 
     # --- the candidates ---------------------------------------------------------------------------
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from typing import Any
 
@@ -95,12 +95,9 @@ class AnnealedLangevinActor(CriticGuidedDenoisingActor):
         self.register_buffer("step_sizes", sizes[levels].to(device), persistent=False)
         self._fix_noise(self.fixed_noise, len(levels))
 
-    def _apply(self, fn: Callable, recurse: bool = True) -> AnnealedLangevinActor:
-        """The sizes of steps, numbers like 1e-4, follow device moves and ignore casts."""
-        sizes = self.step_sizes
-        super()._apply(fn, recurse)
-        self._buffers["step_sizes"] = sizes.to(self.step_sizes.device)
-        return self
+    def exact_buffers(self) -> Iterable[str]:
+        """The sizes of the steps as well, numbers like 1e-4."""
+        return (*super().exact_buffers(), "step_sizes")
 
     def _chains(
         self,

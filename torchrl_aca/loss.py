@@ -357,16 +357,12 @@ class ACALoss(OpenLoopAlpha, AutoGuidance, TDLoss):
         self._tie_guidance()
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """A weight given to ``guidance_weight`` goes to the actor, whose buffer it is."""
+        """A ``guidance_weight`` that is set or loaded goes to the actor, whose buffer it is."""
         actor = self.__dict__.get("actor_network")
         if name == "guidance_weight" and actor is not None and value is not actor.guidance_weight:
             actor.guidance_weight = value
         else:
             super().__setattr__(name, value)
-
-    def _take_loaded(self) -> None:
-        self.actor_network.guidance_weight = self.guidance_weight  # fills the actor's buffer
-        super()._take_loaded()
 
     def _apply(self, fn: Callable) -> ACALoss:
         """Take the actor along."""

@@ -191,7 +191,7 @@ def _reward_keys(env: EnvBase) -> dict[str, NestedKey]:
     """Keys of reward, done and terminated, each where the environment has one alone."""
     found = {"reward": list(env.reward_keys)}
     for name in ("done", "terminated"):
-        found[name] = [key for key in env.done_keys if name in (key, key[-1])]
+        found[name] = [key for key in env.done_keys if key == name or key[-1] == name]
     return {name: keys[0] for name, keys in found.items() if len(keys) == 1}
 
 

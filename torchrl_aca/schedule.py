@@ -2,29 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchrl_aca import functional as F
+from torchrl_aca.exact import ExactBuffers
 
 __all__ = ["NoiseSchedule", "VarianceExplodingSchedule"]
 
 
-class _Constants(nn.Module):
-    """Buffers that follow device moves and ignore casts: chains divide by numbers like 1e-3."""
-
-    def _apply(self, fn: Callable, recurse: bool = True) -> Any:
-        exact = dict(self.named_buffers())
-        super()._apply(fn, recurse)
-        for name, moved in list(self.named_buffers()):
-            self._buffers[name] = exact[name].to(moved.device)
-        return self
-
-
-class NoiseSchedule(_Constants):
+class NoiseSchedule(ExactBuffers):
     """Constants of a discrete diffusion process with ``T`` noise levels.
 
     Every attribute listed below is a buffer of shape ``(T,)``, float64 but for the levels; row
@@ -151,7 +140,7 @@ class NoiseSchedule(_Constants):
         return rows.to(dtype).reshape(*noise_level.shape, 1)
 
 
-class VarianceExplodingSchedule(_Constants):
+class VarianceExplodingSchedule(ExactBuffers):
     """Noise that is added to an action without shrinking it: ``a_k = a_0 + sigma_k eps``.
 
     ``sigma_k = sigma_min (sigma_max / sigma_min)^(k / T)`` for the levels ``k = 0..T`` (Song &

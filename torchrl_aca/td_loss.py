@@ -156,10 +156,6 @@ class TDLoss(LossModule):
         """Give ``qvalue_network`` the loss's parameters and buffers."""
         self.qvalue_network_params.to_module(self.qvalue_network)
 
-    def _take_loaded(self) -> None:
-        """Bring what a state dict has put into the loss to the parts that hold the same."""
-        self._tie()
-
     def __deepcopy__(self, memo: dict[int, Any]) -> Any:
         """A copy of its own whose parts hold the same parameters, as do optimisers copied along."""
         clone = self.__class__.__new__(self.__class__)
@@ -209,7 +205,7 @@ class TDLoss(LossModule):
 
 def _tie_loaded(loss: TDLoss, incompatible_keys: Any) -> None:
     """With ``assign=True`` the tensors of a state dict take the place of those that were tied."""
-    loss._take_loaded()
+    loss._tie()
 
 
 def next_key(key: NestedKey) -> NestedKey:

@@ -47,7 +47,10 @@ def launch(
     except RunError as error:
         raise SystemExit(f"error: {error}") from None
     start, info = time.perf_counter(), versions()
-    study(cfg, run_dir)
+    try:
+        study(cfg, run_dir)
+    except KeyboardInterrupt:
+        raise SystemExit(f"stopped; what was finished by then is in {run_dir}") from None
     minutes = round((time.perf_counter() - start) / 60, 1)
     command = " ".join(["python", *sys.argv])
     tables.write_card(run_dir, {"command": command, "wall-clock time": f"{minutes} min", **info})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,7 @@ from agents import configured
 from data.config import OfflineToOnlineConfig
 from torchrl_aca.errors import RunError
 from torchrl_aca.training.config import Count, RunConfig, Section, Seed, override
+from torchrl_aca.training.files import write_text
 
 FOLDER = Path(__file__).parents[1]
 
@@ -120,14 +122,21 @@ def make_jobs(cfg: StudyConfig) -> list[Job]:
     """The jobs, all seeds of one task and method before the next.
 
     Raises:
-        RunError: If a setting of any of them is wrong.
+        RunError: If a setting of any of them is wrong, or two of them have one directory.
     """
-    return [
+    jobs = [
         job
         for task in cfg.study.tasks
         for method in cfg.study.methods
         for job in _jobs_of(cfg, task, method)
     ]
+    for name, number in Counter(job.dir.name for job in jobs).items():
+        if number > 1:
+            raise RunError(
+                f"study={cfg.study.name}: {number} jobs are named {name}; expected a directory for "
+                "each. Give every seed once, and tasks and methods that are apart when joined."
+            )
+    return jobs
 
 
 def _jobs_of(cfg: StudyConfig, task: str, method: str) -> Iterator[Job]:
@@ -178,4 +187,4 @@ def write_study(cfg: StudyConfig) -> None:
                 )
             for key in ("tasks", "methods"):  # a part of a study may be run on its own
                 study[key] = {**found[key], **study[key]}
-        OmegaConf.save(study, path)
+        write_text(path, OmegaConf.to_yaml(study))

@@ -55,10 +55,14 @@ def run_job(job: Job, threads: int, stop: StopSignal | None = None) -> int:
 
 
 def run_local(settings: Local, jobs: Sequence[Job], threads: int, stop: StopSignal) -> Results:
-    """On this machine; a signal is passed on to the jobs, which save."""
-    at_once = settings.jobs or max(1, _num_cores() // threads)
-    with ThreadPoolExecutor(at_once) as pool:
-        yield from _ended({pool.submit(run_job, job, threads, stop): job for job in jobs})
+    """On this machine; a signal is passed on to the jobs, which save, and a second one as well."""
+    num_jobs = settings.jobs or max(1, _num_cores() // threads)
+    with ThreadPoolExecutor(num_jobs) as pool:
+        try:
+            yield from _ended({pool.submit(run_job, job, threads, stop): job for job in jobs})
+        except KeyboardInterrupt:
+            stop.at_once = True
+            raise
 
 
 def _num_cores() -> int:

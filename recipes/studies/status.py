@@ -62,6 +62,9 @@ def _progress(job: Job) -> tuple[int, float]:
     return updates, float(rows[-1]["seconds"])
 
 
+HYDRA_HINT = "HYDRA_FULL_ERROR=1"
+
+
 def has_failed(job: Job) -> bool:
     """Whether the job's latest command has ended in another way than it was asked to."""
     path = job.exit_status
@@ -69,9 +72,13 @@ def has_failed(job: Job) -> bool:
 
 
 def last_line(job: Job) -> str:
-    """The last line of a job's output: why it stopped."""
+    """The last line of a job's output that says why it stopped.
+
+    Indented lines and Hydra's hint behind an exception, or a warning's source, say nothing of it.
+    """
     lines = job.output.read_text().splitlines() if job.output.exists() else []
-    return next((line for line in reversed(lines) if line.strip()), "")
+    told = (line for line in reversed(lines) if line[:1].strip() and HYDRA_HINT not in line)
+    return next(told, "")
 
 
 def status_table(jobs: Sequence[Job]) -> str:

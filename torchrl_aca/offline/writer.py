@@ -112,14 +112,16 @@ class DatasetWriter:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        self._open.close()
-        if self._owns_staging():
-            shutil.rmtree(self.staging)
-            if kind is None:
-                raise DatasetError(
-                    f"{self.path} was not written: finish() was never called. Call it at the end "
-                    "of the `with` block."
-                )
+        try:
+            self._open.close()  # fails where the disk is full
+        finally:
+            if unfinished := self._owns_staging():
+                shutil.rmtree(self.staging)
+        if unfinished and kind is None:
+            raise DatasetError(
+                f"{self.path} was not written: finish() was never called. Call it at the end of "
+                "the `with` block."
+            )
 
     def add_episode(
         self,

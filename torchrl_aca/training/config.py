@@ -18,6 +18,7 @@ Seed = Annotated[int, Field(ge=0, lt=2**32 - 10**6)]  # of NumPy's range, with r
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
+Text = Annotated[str, Field(min_length=1)]
 Device = Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
 Threads = Annotated[int, Field(ge=1, le=4096)] | None
 Activation = Literal["Mish", "ReLU", "GELU"]
@@ -43,13 +44,13 @@ class Wrapper(Section):
 
     model_config = ConfigDict(extra="allow")
 
-    name: str = Field(min_length=1)
+    name: Text
 
 
 class Env(Section):
     """The task."""
 
-    name: str = Field(min_length=1)
+    name: Text
     kwargs: dict[str, Any] | None = None
     wrappers: list[Wrapper] = []
 
@@ -142,9 +143,9 @@ class RunConfig(Section):
     compile: bool
     matmul_precision: Literal["highest", "high", "medium"]
     cudagraphs: bool
-    run_dir: str | None
+    run_dir: Text | None
     existing: Literal["fail", "resume"] = "fail"  # checkpoints of before have no such key
-    resume: str | None
+    resume: Text | None
     env: Env
     algo: Algo
     collector: Collector

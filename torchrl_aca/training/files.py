@@ -16,14 +16,19 @@ import torch
 def replace_file(path: Path, write: Callable[[BinaryIO], object]) -> None:
     """Writes a file under a temporary name and renames it when it is complete.
 
-    A crash, a kill or a full disk in between leaves what stood there before.
+    A crash, a kill or a full disk in between leaves what stood there before; a kill, or a second
+    signal, the temporary file as well.
     """
     temporary = path.with_name(f"{path.name}.tmp")
-    with open(temporary, "wb") as file:
-        write(file)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
+    try:
+        with open(temporary, "wb") as file:
+            write(file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
 
 
 def write_text(path: Path, text: str) -> None:

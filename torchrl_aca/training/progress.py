@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections.abc import Mapping
@@ -10,6 +11,20 @@ from tqdm import tqdm
 
 SHOWN = ("return", "loss")
 REFRESH = 0.2  # seconds between two changes of the bar's description
+
+
+def say(message: str) -> None:
+    """Prints a line at once. What is lost where nobody can read it is the line, and not the run.
+
+    A reader such as `head` or an interrupted `tee` may have gone, a disk may be full, and a signal
+    may come in the middle of another line.
+    """
+    try:
+        print(message, flush=True)
+    except BrokenPipeError:  # or Python fails again when it ends, and has another exit status
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except (OSError, RuntimeError):
+        pass
 
 
 def duration(seconds: float) -> str:
@@ -111,7 +126,7 @@ class ProgressBar:
     def write(self, message: str) -> None:
         """Prints a line above the bar."""
         if self.bar.disable:
-            print(message, flush=True)
+            say(message)
         else:
             self.bar.write(message)
 

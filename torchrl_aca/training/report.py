@@ -68,12 +68,14 @@ def _cpu_model() -> str:
 def write_card(
     run_dir: Path,
     config: Mapping[str, Any],
+    axes: Mapping[str, int],
     evaluations: Sequence[Mapping[str, Any]],
     seconds: float,
     facts: Mapping[str, object],
 ) -> None:
-    """Writes card.md: what was run, on what, what came out, and whatever `facts` adds."""
+    """Writes card.md: what was run, how far, on what, what came out, and whatever `facts` adds."""
     last = evaluations[-1]
+    place = f" after {last['updates']} updates" * (int(last["updates"]) != axes["updates"])
     info = _stored_versions(run_dir)
     score = last.get("normalized_score")
     scores = {} if score is None else {"normalised score": f"{float(score):.1f}"}
@@ -81,9 +83,9 @@ def write_card(
         "environment": config["env"]["name"],
         "algorithm": config["algo"]["name"],
         "seed": config["seed"],
-        "updates": last["updates"],
-        "environment frames": f"{last['frames']} (warm-up included)",
-        "final return": _told(last),
+        "updates": axes["updates"],
+        "environment frames": f"{axes['frames']} (warm-up included)",
+        f"last return{place}": _told(last),
         **scores,
         **facts,
         "wall-clock time": f"{seconds / 60:.1f} min",

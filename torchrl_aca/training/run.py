@@ -118,9 +118,12 @@ class Run:
     def _open(self, resumed: bool) -> None:
         """Writes what describes the run, and opens its log."""
         counters, cfg = self.counters, self.cfg
-        (self.dir / DONE).unlink(missing_ok=True)
         if resumed:
             require_newest(self.dir, counters.total)
+        (self.dir / DONE).unlink(missing_ok=True)
+        for left in (self.dir / "checkpoints").glob("*.tmp"):  # by a process that was killed
+            left.unlink()
+        if resumed:
             drop_newer_policies(self.dir / "checkpoints", counters.total)
         else:
             made_with = versions() | {"parameters": self.agent.num_parameters}
@@ -270,11 +273,18 @@ class Run:
 
     def save(self) -> Path:
         """Writes a checkpoint of all parts."""
-        self._saved = (self.counters.total, self.collection.frames)
         directory, keep_last = self.dir / "checkpoints", self.cfg.checkpoint.keep_last
         updates = self.counters.total
-        self._save_policy(updates)  # first, so that no checkpoint is without one
-        return save_checkpoint(directory, self.parts, self.config, updates, keep_last)
+        try:
+            self._save_policy(updates)  # first, so that no checkpoint is without one
+            path = save_checkpoint(directory, self.parts, self.config, updates, keep_last)
+        except (OSError, RuntimeError) as error:  # torch's own where the disk is full
+            raise RunError(
+                f"{directory} cannot be written: {error}. Make room; what was saved before is "
+                f"whole: {override('resume', self.dir)}."
+            ) from error
+        self._saved = (updates, self.collection.frames)
+        return path
 
     def _save_policy(
         self, which: int | Literal["best"], evaluation: Mapping[str, float] | None = None
@@ -300,9 +310,12 @@ class Run:
                 raise RunError(
                     f"{self.cfg.env.name}: {error} What came before is in {self.save()}."
                 ) from None
-            elif isinstance(error, KeyboardInterrupt):
-                self._tell_stop("at once", "go on from the newest checkpoint")
+        except KeyboardInterrupt as second:
+            error = second
+            raise
         finally:
+            if isinstance(error, KeyboardInterrupt):
+                self._tell_stop("at once", "go on from the newest checkpoint")
             self._signal.__exit__()
             self.bar.close()
             self.logger.close()
@@ -318,7 +331,7 @@ class Run:
             write_text(self.dir / DONE, f"{self.counters.updates}\n")
         rows = self.logger.tables["eval"].rows
         title = f"{self.cfg.algo.name} on {self.cfg.env.name}"
-        write_card(self.dir, self.config, rows, self.counters.seconds, self.facts)
+        write_card(self.dir, self.config, self._axes(), rows, self.counters.seconds, self.facts)
         plot_curve(self.dir, title, rows)
         if self.completed:
             before, after = (float(row["return_mean"]) for row in (rows[0], rows[-1]))

@@ -59,9 +59,9 @@ def lock(run_dir: Path) -> FileLock:
     The file stays: to remove it would let two processes lock two files of one name.
 
     Raises:
-        RunError: If another process has it.
+        RunError: If another process has it, or the directory cannot be written.
     """
-    found = FileLock(run_dir / ".lock")
+    found = _lock_of(run_dir)
     try:
         found.acquire(blocking=False)
     except Timeout:
@@ -69,18 +69,29 @@ def lock(run_dir: Path) -> FileLock:
             f"{run_dir}: another process is at work on this run. Wait for its end, or stop it with "
             "Ctrl-C first: it leaves a checkpoint."
         ) from None
+    except OSError as error:
+        raise RunError(f"{run_dir} cannot be written: {error}. Mend that.") from error
     return found
 
 
+def _lock_of(run_dir: Path) -> FileLock:
+    return FileLock(run_dir / ".lock")
+
+
 def is_locked(run_dir: Path) -> bool:
-    """Whether a process, on this machine or another one of a shared disk, is at work on a run."""
+    """Whether a process, on this machine or another one of a shared disk, is at work on a run.
+
+    False as well where that cannot be told, as the disk is for reading alone.
+    """
     if not (run_dir / ".lock").exists():
         return False
     try:
-        lock(run_dir).release()
-    except RunError:
+        with _lock_of(run_dir).acquire(blocking=False):
+            return False
+    except Timeout:
         return True
-    return False
+    except OSError:
+        return False
 
 
 def require_newest(run_dir: Path, updates: int) -> None:

@@ -8,6 +8,8 @@ from collections.abc import Callable, Mapping, Sequence
 from types import FrameType
 from typing import Any
 
+from torchrl_aca.training.progress import say
+
 STOPPED = 143  # exit status of a run that was told to stop; that of a shell for SIGTERM
 
 
@@ -19,6 +21,7 @@ class StopSignal:
 
     Attributes:
         received: The signal's name, or None.
+        at_once: Whether commands that were told to stop are to end without saving.
         activity: What the run is in the middle of, for the answer to the user.
     """
 
@@ -28,13 +31,14 @@ class StopSignal:
         signal.SIGTERM: signal.SIG_DFL,
     }
 
-    def __init__(self, say: Callable[[str], None] = print) -> None:
+    def __init__(self, say: Callable[[str], None] = say) -> None:
         """Does nothing until it is entered.
 
         Args:
             say: Shows a line to the user; called at once when a signal arrives.
         """
         self.received: str | None = None
+        self.at_once = False
         self.activity = "iteration"
         self._say = say
 
@@ -56,11 +60,11 @@ class StopSignal:
 
 
 def run_command(command: Sequence[str], stop: StopSignal, **options: Any) -> int:
-    """Runs a command to its end, and tells it once if it is to stop.
+    """Runs a command to its end, and tells it if it is to stop.
 
     Args:
         command: A program and its arguments.
-        stop: The wish to stop; the program gets it as SIGTERM.
+        stop: The wish to stop; the program gets it as SIGTERM, and as a second one `at_once`.
         options: For `subprocess.Popen`.
 
     Returns:
@@ -69,12 +73,12 @@ def run_command(command: Sequence[str], stop: StopSignal, **options: Any) -> int
     """
     # A session of its own: Ctrl-C reaches it once, through this process.
     process = subprocess.Popen(command, start_new_session=True, **options)
-    told = False
+    told = 0
     try:
         while True:
-            if stop.received and not told:
+            if told < bool(stop.received) + stop.at_once:
                 process.terminate()
-                told = True
+                told += 1
             try:
                 code = process.wait(timeout=0.2)
                 return STOPPED if told and code == -signal.SIGTERM else code
