@@ -9,6 +9,7 @@ the torch (>= 2.8) and the TorchRL (>= 0.14) that it is called with, and install
 from __future__ import annotations
 
 import argparse
+import os
 import shutil
 import subprocess
 import sys
@@ -20,6 +21,7 @@ import torch
 from torch.utils.benchmark import Timer
 
 from recipe import configure, make_recipe_agent, random_batch
+from torchrl_aca.training.acceleration import capture
 from torchrl_aca.training.envs import make_vector_env
 from torchrl_aca.training.report import versions
 
@@ -63,10 +65,11 @@ def measure(case: Case, device: torch.device, seconds: float) -> tuple[float, fl
     )
     batch = random_batch(*sizes, cfg.optim.batch_size).to(device)
     state = env.reset().to(device)
+    policy = capture(agent.policy, cfg.cudagraphs)
 
     @torch.no_grad()
     def act() -> None:
-        agent.policy(state)
+        policy(state)
 
     for _ in range(12):  # six updates of each kind: one more than a graph's warm-up
         act()
@@ -90,8 +93,9 @@ def table(device: torch.device, cases: Sequence[Case], seconds: float) -> Iterat
 
 
 def run_tests() -> int:
-    """The tests marked `gpu`, in a process of their own; returns its exit status."""
-    command = [sys.executable, "-m", "pytest", "-m", "gpu", "-q", "-p", "no:cacheprovider"]
+    """The tests marked `gpu`, which mostly compile, on all cores; returns pytest's exit status."""
+    workers = str(min(os.cpu_count() or 1, 12))
+    command = [sys.executable, "-m", "pytest", "-m", "gpu", "-q", "-n", workers]
     return subprocess.run(command, cwd=ROOT, check=False).returncode
 
 

@@ -34,6 +34,7 @@ from data.offline import (
     task_scores,
 )
 from torchrl_aca.offline.scores import normalized_score
+from torchrl_aca.training.acceleration import capture
 from torchrl_aca.training.envs import make_vector_env
 from torchrl_aca.training.evaluation import evaluate, make_eval_env, report_extras
 from torchrl_aca.training.launch import launch, make_device
@@ -67,8 +68,10 @@ def train(cfg: DictConfig, checkpoint: dict[str, Any] | None = None) -> Path:
     if cfg.pretrained is not None and checkpoint is None:
         pretrained = cfg.optim.offline_updates = start_from(cfg, agent, facts)
 
+    evaluated = capture(agent.policy, cfg.cudagraphs)
+
     def evaluation(watch: Callable[[int], None]) -> dict[str, float]:
-        result = evaluate(agent.policy, eval_env, cfg.eval.seed, device, watch)
+        result = evaluate(evaluated, eval_env, cfg.eval.seed, device, watch)
         if scores:
             result["normalized_score"] = normalized_score(result["return_mean"], scores)
         return result

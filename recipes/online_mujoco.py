@@ -24,6 +24,7 @@ import renderer  # noqa: F401
 from agents import configured, make_agent
 from agents.pretrained import refuse_offline_phase
 from torchrl_aca.replay import make_replay_buffer
+from torchrl_aca.training.acceleration import capture
 from torchrl_aca.training.envs import make_vector_env
 from torchrl_aca.training.evaluation import evaluate, make_eval_env, report_extras
 from torchrl_aca.training.launch import launch, make_device
@@ -46,7 +47,8 @@ def train(cfg: DictConfig, checkpoint: dict[str, Any] | None = None) -> Path:
     agent = make_agent(cfg, env, device)
     buffer = make_replay_buffer(cfg.buffer.capacity, cfg.optim.batch_size)
     collection = make_collection(cfg, env, agent.policy, device)
-    evaluation = partial(evaluate, agent.policy, eval_env, cfg.eval.seed, device)
+    evaluated = capture(agent.policy, cfg.cudagraphs)
+    evaluation = partial(evaluate, evaluated, eval_env, cfg.eval.seed, device)
 
     with Run(
         cfg, agent, buffer, collection, evaluation, checkpoint, device=device, script=__file__

@@ -12,6 +12,7 @@ from recipe_cases import TINY, batch_of, composed, rows_of
 from torchrl_aca.training import load_policy
 from torchrl_aca.training.acceleration import capture, descend, make_adam
 from torchrl_aca.training.envs import make_vector_env
+from torchrl_aca.training.evaluation import evaluation_mode
 from torchrl_aca.training.resume import resumed_config
 
 NO_CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
@@ -95,6 +96,11 @@ def test_captured_steps_are_those_that_run_as_they_are():
         torch.testing.assert_close(two, one, **TOLERANCE)
 
 
+def agent_on_gpu(algo: str, *switches: str):
+    cfg = configured(composed(*TINY[algo], "env=inverted_pendulum", "device=cuda", *switches))
+    return make_agent(cfg, make_vector_env(cfg.env.name, 1, 0), torch.device("cuda"))
+
+
 @pytest.mark.parametrize("algo", TINY)
 @pytest.mark.parametrize(
     "switches", [[], ["compile=true"], ["compile=true", "cudagraphs=true"]], ids=str
@@ -102,23 +108,50 @@ def test_captured_steps_are_those_that_run_as_they_are():
 @pytest.mark.gpu
 @NO_CUDA
 def test_updates_of_every_method_are_finite_and_move_the_parameters(algo, switches):
-    cfg = configured(composed(*TINY[algo], "env=inverted_pendulum", "device=cuda", *switches))
-    agent = make_agent(cfg, make_vector_env(cfg.env.name, 1, 0), torch.device("cuda"))
+    agent = agent_on_gpu(algo, *switches)
     before = [param.detach().clone() for param in agent.state["loss"].parameters()]
     for number in range(14):
-        batch = batch_of(number, 16).to("cuda")
+        batch = agent.offline_rows_of(batch_of(number, 16)).to("cuda")
         metrics = agent.update(batch)
         assert all(value.isfinite().all() for value in metrics.values())
     after = list(agent.state["loss"].parameters())
     assert any(not torch.equal(one, two) for one, two in zip(before, after, strict=True))
 
 
-def test_a_run_trains_stops_and_goes_on_and_its_policy_is_loaded_on_the_cpu(device, tmp_path):
-    run_dir = tmp_path / "run"
-    shared = [*TINY["aca"], f"device={device.type}", f"run_dir={run_dir}"]
-    train(composed(*shared, "optim.total_updates=30"))
+@pytest.mark.parametrize("algo", TINY)
+@pytest.mark.gpu
+@NO_CUDA
+def test_a_captured_policy_acts_as_the_plain_one(algo):
+    """In more calls than the warm-up; on the same draws, as an evaluation has them."""
+    agent = agent_on_gpu(algo)
+    captured = capture(agent.policy, True)
+    with evaluation_mode(0):
+        for number in range(12):
+            states = batch_of(number, 16).select("observation").to("cuda")
+            expected = agent.policy(states.copy())["action"].clone()
+            torch.testing.assert_close(captured(states)["action"], expected, **TOLERANCE)
+
+
+def trains_stops_and_goes_on(run_dir, *settings):
+    """A run of 60 updates in two parts; returns its policy."""
+    settings = [*settings, f"run_dir={run_dir}"]
+    train(composed(*settings, "optim.total_updates=30"))
     more = "optim.total_updates=60"
     train(*resumed_config(composed(f"resume={run_dir}", more), [more]))
     assert rows_of(run_dir / "eval.csv")[-1]["updates"] == "60"
-    policy = load_policy(run_dir)
+    return load_policy(run_dir)
+
+
+def test_a_run_trains_stops_and_goes_on_and_its_policy_is_loaded_on_the_cpu(device, tmp_path):
+    policy = trains_stops_and_goes_on(tmp_path / "run", *TINY["aca"], f"device={device.type}")
     assert {param.device.type for param in policy.parameters()} == {"cpu"}
+
+
+@pytest.mark.parametrize("algo", TINY)
+@pytest.mark.gpu
+@NO_CUDA
+def test_a_run_of_every_method_with_graphs_goes_on(algo, tmp_path):
+    policy = trains_stops_and_goes_on(
+        tmp_path / "run", *TINY[algo], "device=cuda", "cudagraphs=true"
+    )
+    assert all(param.isfinite().all() for param in policy.parameters())

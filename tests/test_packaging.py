@@ -13,6 +13,8 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+import torchrl_aca
+
 if sys.version_info >= (3, 11):
     import tomllib
 else:
@@ -220,4 +222,4 @@ def test_extra_all_names_every_extra_that_goes_with_the_others() -> None:
 
 def test_citation_names_this_version() -> None:
     citation = (ROOT / "CITATION.cff").read_text()
-    assert re.findall(r"^version: (.+)$", citation, re.M) == [PROJECT["version"]]
+    assert re.findall(r"^version: (.+)$", citation, re.M) == [torchrl_aca.__version__]

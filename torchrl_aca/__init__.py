@@ -1,7 +1,5 @@
 """Actor-Critic without Actor (ACA) as composable TorchRL modules."""
 
-from importlib.metadata import version
-
 from torchrl_aca.actor import CriticGuidedDenoisingActor
 from torchrl_aca.critic import NoiseLevelCritic, NoiseLevelCriticBase
 from torchrl_aca.custom_critic import CustomCritic
@@ -19,4 +17,4 @@ __all__ = [
     "make_aca",
     "make_aca_actor",
 ]
-__version__ = version("torchrl-aca")
+__version__ = "0.1.0"

@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import CudaGraphModule
 
 Step = Callable[[TensorDictBase], TensorDictBase | None]
+WARMUP = 5  # calls before a graph is captured: what they compile must not be recorded
 
 
 def compiled(function: Callable[..., Any], enabled: bool) -> Callable[..., Any]:
@@ -28,7 +29,7 @@ def capture(step: Step, enabled: bool) -> Step:
             result is detached.
         enabled: Whether to capture.
     """
-    return CudaGraphModule(step, in_keys=[], out_keys=[], warmup=5) if enabled else step
+    return CudaGraphModule(step, in_keys=[], out_keys=[], warmup=WARMUP) if enabled else step
 
 
 def make_adam(

@@ -13,6 +13,7 @@ from torchrl.collectors import BaseCollector, Collector
 from torchrl.envs import GymWrapper
 
 from torchrl_aca.errors import RunError
+from torchrl_aca.training.acceleration import WARMUP
 from torchrl_aca.training.config import Collector as CollectorSettings
 from torchrl_aca.training.env_state import EnvState
 from torchrl_aca.training.randomness import RandomState
@@ -41,6 +42,7 @@ class Collection:
         policy: TensorDictModuleBase,
         settings: CollectorSettings,
         device: torch.device | str = "cpu",
+        captured: bool = False,
     ) -> None:
         """Takes what acts on what.
 
@@ -49,8 +51,9 @@ class Collection:
             policy: Maps observations to actions.
             settings: Frames of a batch, frames before the first update, and who acts meanwhile.
             device: Device of the policy.
+            captured: Whether the policy acts through a CUDA graph.
         """
-        self.env, self.policy, self.device = env, policy, device
+        self.env, self.policy, self.device, self.captured = env, policy, device, captured
         self.settings = settings
         self.frames = 0
         self.episodes = EpisodeTracker(env.batch_size.numel())
@@ -89,6 +92,7 @@ class Collection:
             policy_device=self.device,
             env_device="cpu",
             storing_device="cpu",
+            cudagraph_policy={"warmup": WARMUP} if self.captured else False,
             auto_register_policy_transforms=False,  # these policies are feed-forward
         )
 

@@ -39,7 +39,7 @@ def make_collection(
         RunError: If Ray is missing, or has fewer processors than workers.
     """
     if cfg.collector.backend == "direct":
-        return Collection(env, policy, cfg.collector, device)
+        return Collection(env, policy, cfg.collector, device, cfg.cudagraphs)
     return WorkerCollection(cfg, env, policy, device)
 
 
