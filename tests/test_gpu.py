@@ -122,13 +122,15 @@ def test_updates_of_every_method_are_finite_and_move_the_parameters(algo, switch
 @pytest.mark.gpu
 @NO_CUDA
 def test_a_captured_policy_acts_as_the_plain_one(algo):
-    """In more calls than the warm-up; on the same draws, as an evaluation has them."""
+    """In more calls than the warm-up, from the same seed each."""
     agent = agent_on_gpu(algo)
     captured = capture(agent.policy, True)
     with evaluation_mode(0):
         for number in range(12):
             states = batch_of(number, 16).select("observation").to("cuda")
+            torch.manual_seed(number)
             expected = agent.policy(states.copy())["action"].clone()
+            torch.manual_seed(number)
             torch.testing.assert_close(captured(states)["action"], expected, **TOLERANCE)
 
 
