@@ -9,6 +9,7 @@ import math
 import pytest
 import torch
 from tensordict import TensorDict
+from torch.utils._python_dispatch import TorchDispatchMode
 from torchrl.data import Bounded
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import TanhNormal
@@ -183,6 +184,26 @@ def test_an_update_leaves_its_batch_as_it_is_and_gives_detached_numbers(algo):
     assert set(batch.keys(True, True)) - set(before.keys(True, True)) == set(agent.rewrites)
     for key in before.keys(True, True):
         assert torch.equal(before[key], batch[key]), key
+
+
+class RefuseReadingValues(TorchDispatchMode):
+    """Raises where a value of a tensor decides what comes next, which no CUDA graph can record."""
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        assert func is not torch.ops.aten._local_scalar_dense.default, "a value was read"
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("algo", EVERY)
+def test_acting_reads_no_value(algo, monkeypatch):
+    capturing = f"{TanhNormal.__module__}.safe_is_current_stream_capturing"
+    monkeypatch.setattr(capturing, lambda: True)  # TanhNormal reads its bounds everywhere else
+    agent = built(algo)
+    for how in (ExplorationType.RANDOM, ExplorationType.DETERMINISTIC):
+        states = batch_of(0).select("observation")
+        with set_exploration_type(how), torch.no_grad(), RefuseReadingValues():
+            agent.policy(states)
+        assert states["action"].isfinite().all()
 
 
 @pytest.mark.parametrize("algo", EVERY)

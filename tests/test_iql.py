@@ -5,12 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
+from torchrl.data import Bounded
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import ValueOperator
 from torchrl.objectives import IQLLoss
 
 from ensemble_oracle import ACT, BATCH, EXACT, GAMMA, MEMBERS, Oracle, assert_slope, seeded
 from loss_cases import OBSERVATION_DIM, make_iql, make_rlpd_data
-from torchrl_aca.baselines import EnsembleMLP
+from torchrl_aca.baselines import EnsembleMLP, make_clipped_gaussian_policy
+from torchrl_aca.baselines.gaussian_policy import ClippedNormal
 
 TAU, BETA, MAX_WEIGHT = 0.7, 3.0, 100.0
 
@@ -134,6 +138,25 @@ def test_with_all_members_it_is_torchrls_loss():
         torch.testing.assert_close(
             theirs.qvalue_network_params[key].grad.squeeze(1), stack.grad, rtol=1e-6, atol=1e-9
         )
+
+
+def test_the_policy_clips_its_actions_and_scores_what_they_were_before():
+    policy = make_clipped_gaussian_policy(3, Bounded(-0.1, 0.1, shape=(1,)), num_cells=[4])
+    states = TensorDict(observation=torch.randn(50, 3), batch_size=[50])
+    with set_exploration_type(ExplorationType.RANDOM):
+        actions = policy(states)["action"]
+    assert actions.max() == 0.1 and actions.min() == -0.1
+
+    loc = torch.tensor([[1.0], [-5.0], [0.25]])
+    low, high = torch.tensor([-2.0]), torch.tensor([0.5])
+    draws = ClippedNormal(loc, torch.full((3, 1), 0.1), low=low, high=high)
+    expected = torch.tensor([[0.5], [-2.0], [0.25]])
+    torch.testing.assert_close(draws.deterministic_sample, expected)
+    for sample in (draws.sample(torch.Size([9])), draws.rsample(torch.Size([9]))):
+        assert sample.shape == (9, 3, 1)
+        assert (sample[:, :2] == expected[:2]).all() and sample[:, 2].std() > 0
+    density = torch.distributions.Normal(loc, 0.1).log_prob(torch.zeros(3, 1))[:, 0]
+    torch.testing.assert_close(draws.log_prob(torch.zeros(3, 1)), density)
 
 
 def test_bad_options_are_refused():

@@ -223,6 +223,23 @@ def test_a_full_disk_leaves_the_file_that_was_there(tmp_path):
     assert list(tmp_path.iterdir()) == [path]  # and the room is free again
 
 
+def test_a_signal_that_comes_twice_at_once_is_one_wish(monkeypatch):
+    """As `timeout` sends it, to the process and to its group; a later one ends the run."""
+    twice = []
+
+    def arrives_again(seconds):
+        twice.append(seconds)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr("torchrl_aca.training.signals.time.sleep", arrives_again)
+    said = []
+    with StopSignal(said.append) as stop:
+        signal.raise_signal(signal.SIGINT)
+        assert (stop.received, len(said), len(twice)) == ("SIGINT", 1, 1)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+
+
 @pytest.mark.parametrize("fault", [BrokenPipeError(), OSError(28, "full"), RuntimeError("again")])
 def test_a_line_that_nobody_can_read_is_lost_alone(fault, monkeypatch):
     class Reader(io.TextIOWrapper):

@@ -77,6 +77,31 @@ class RescaledTanhNormal(TanhNormal):
         return ((self.high - self.low) / 2).log().sum(-1)
 
 
+class ClippedNormal(IndependentNormal):
+    """A Gaussian whose samples are clipped to bounds; its densities are those before the clip.
+
+    TorchRL's ``safe=True`` clips too, but first reads whether it must, which no CUDA graph can.
+    """
+
+    def __init__(self, loc: Tensor, scale: Tensor, *, low: Tensor, high: Tensor) -> None:
+        """Takes mean and standard deviation, (..., A) each, and the bounds, (A,) each."""
+        super().__init__(loc, scale)
+        self.low, self.high = low.to(loc.device), high.to(loc.device)
+
+    def rsample(self, sample_shape: Sequence[int] = ()) -> Tensor:
+        """Returns actions with a gradient, where the bounds leave one."""
+        return super().rsample(torch.Size(sample_shape)).clamp(self.low, self.high)
+
+    def sample(self, sample_shape: Sequence[int] = ()) -> Tensor:
+        """Returns actions without a gradient."""
+        return super().sample(torch.Size(sample_shape)).clamp(self.low, self.high)
+
+    @property
+    def deterministic_sample(self) -> Tensor:
+        """The clipped mean."""
+        return self.mean.clamp(self.low, self.high)
+
+
 class FreeStd(nn.Module):
     """Puts a mean in [-1, 1] into env units, beside a standard deviation that no state changes."""
 
@@ -215,6 +240,6 @@ def make_clipped_gaussian_policy(
         TensorDictModule(network, in_keys=["observation"], out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
         spec=spec,
-        safe=True,
-        distribution_class=IndependentNormal,
+        distribution_class=ClippedNormal,
+        distribution_kwargs={"low": spec.space.low, "high": spec.space.high},
     )

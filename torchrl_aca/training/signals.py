@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import subprocess
+import time
 from collections.abc import Callable, Mapping, Sequence
 from types import FrameType
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 from torchrl_aca.training.progress import say
 
 STOPPED = 143  # exit status of a run that was told to stop; that of a shell for SIGTERM
+TWINS = 0.1  # seconds; `timeout` tells the process, and then its group, which is one wish
 
 
 class StopSignal:
@@ -53,7 +55,10 @@ class StopSignal:
             signal.signal(number, handler)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
+        if self.received:  # here once more while waiting below
+            return
         self.received = signal.Signals(number).name
+        time.sleep(TWINS)
         for each, handler in self.AT_ONCE.items():
             signal.signal(each, handler)
         self._say(f"{self.received}: stopping after this {self.activity}; Ctrl-C again quits")
