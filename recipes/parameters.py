@@ -9,7 +9,7 @@ target critics and moving averages of policies.
 
 from __future__ import annotations
 
-import sys
+import argparse
 from pathlib import Path
 
 import hydra
@@ -65,5 +65,13 @@ def table(env_name: str) -> str:
     return "\n".join(lines)
 
 
+def main() -> None:
+    """Prints the table of a task."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    tasks = sorted(path.stem for path in (CONFIGS / "env").glob("*.yaml"))
+    parser.add_argument("task", nargs="?", default="humanoid", choices=tasks)
+    print(table(parser.parse_args().task))
+
+
 if __name__ == "__main__":
-    print(table(sys.argv[1] if len(sys.argv) > 1 else "humanoid"))
+    main()

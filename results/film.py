@@ -17,6 +17,7 @@ import imageio.v3 as imageio
 import torch
 from PIL import Image
 
+from torchrl_aca.errors import RunError
 from torchrl_aca.training.config import Env, checked
 from torchrl_aca.training.evaluation import record_video
 from torchrl_aca.training.policy import build_policy, read_policy
@@ -42,6 +43,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seconds", type=float, default=4.0)
     parser.add_argument("--width", type=int, default=200)
     args = parser.parse_args(arguments)
+    try:
+        film_run(args)
+    except RunError as error:
+        raise SystemExit(f"error: {error}") from None
+
+
+def film_run(args: argparse.Namespace) -> None:
+    """Films the newest policy of a run and writes the animation."""
     content = read_policy(args.run)
     with TemporaryDirectory() as folder:
         film = Path(folder) / "film.mp4"

@@ -145,25 +145,34 @@ def table(curves: Sequence[Curve]) -> str:
     return "\n".join(lines)
 
 
+def mark(text: str) -> tuple[str, float]:
+    """What `--line NAME=RETURN` says."""
+    name, _, value = text.rpartition("=")
+    try:
+        return name, float(value)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected NAME=RETURN, got {text!r}") from None
+
+
 def main() -> None:
     """Parses the command line, writes the figure and prints the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("output", type=Path)
     parser.add_argument("run_dirs", type=Path, nargs="+", help="or folders that hold them")
     parser.add_argument("--x", choices=("updates", "frames"), default="updates")
-    parser.add_argument("--line", action="append", default=[], help="NAME=RETURN, drawn dashed")
+    parser.add_argument("--line", type=mark, action="append", default=[], help="NAME=RETURN")
     arguments = parser.parse_args()
 
     curves = make_curves([run for folder in arguments.run_dirs for run in runs_in(folder)])
     tasks = sorted({curve.runs[0].task for curve in curves})
-    lines = {name: float(value) for name, value in (text.split("=") for text in arguments.line)}
     xlabel = unit(curves) if arguments.x == "updates" else "environment frames"
     figure, panels = make_panels(tasks, xlabel)
     for curve, label in zip(curves, labels(curves), strict=True):
         draw(panels[curve.runs[0].task], curve, label, arguments.x)
     for axes in panels.values():
-        draw_marks(axes, lines)
+        draw_marks(axes, dict(arguments.line))
         axes.legend(frameon=False)
+    arguments.output.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(arguments.output, dpi=150)
     for task in tasks:
         print(f"{task}\n" * (len(tasks) > 1) + table([c for c in curves if c.runs[0].task == task]))

@@ -11,7 +11,7 @@ from data.config import OfflineToOnlineConfig
 from online_mujoco import train
 from recipe_cases import CONFIGS, TINY, composed, run
 from torchrl_aca.errors import RunError
-from torchrl_aca.training.config import RunConfig, override
+from torchrl_aca.training.config import Positive, RunConfig, Section, checked, override
 
 REFUSED = [
     ("aca.guidance_weight=abc", "aca.guidance_weight='abc': expected a valid number"),
@@ -177,6 +177,17 @@ def test_a_mistake_beside_another_setting_is_told_as_well(setting, override, mes
 def test_a_mistake_in_the_recipe_with_offline_data_is_told(override, message):
     with pytest.raises(RunError, match=message):
         configured(composed(override, name="o2o_halfcheetah"), OfflineToOnlineConfig)
+
+
+def test_a_value_of_several_types_is_named_by_its_key_alone():
+    class Several(Section):
+        choice: int | list[Positive]
+
+    with pytest.raises(RunError) as told:
+        checked(Several, {"choice": [1.0, -1.0]})
+    first, second = str(told.value).split("\n")
+    assert first.startswith("choice=[1.0, -1.0]: expected a valid integer")
+    assert second.strip().startswith("choice.1=-1.0: expected greater than 0")
 
 
 def test_all_mistakes_are_told_at_once():

@@ -187,7 +187,7 @@ def test_float64_observations_and_rewards_are_taken_by_a_float32_critic(keys):
     for key in keys:
         data[key] = data[key].double()
     out = loss(data)
-    torch.testing.assert_close(out, expected, check_dtype=False)
+    torch.testing.assert_close(out, expected)
     total(out).backward()
 
 

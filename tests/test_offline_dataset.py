@@ -158,6 +158,15 @@ def test_of_two_writers_with_one_path_the_second_one_finishes(tmp_path):
     assert not (dataset.path / "owner").exists()
 
 
+def test_a_path_that_cannot_be_made_is_told(tmp_path):
+    (tmp_path / "file").touch()
+    with (
+        pytest.raises(DatasetError, match="file/data cannot be made: .*Choose another path"),
+        DatasetWriter(tmp_path / "file" / "data", 3, 2),
+    ):
+        pass
+
+
 def test_a_directory_of_another_program_is_left_alone(tmp_path):
     (tmp_path / "data.partial").mkdir()
     (tmp_path / "data.partial" / "thesis.txt").write_text("years")

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from agents import AGENTS
-from parameters import PAPER, table
+from parameters import PAPER, main, table
 
 PAGE = Path(__file__).parents[1] / "docs" / "rivals.md"
 
@@ -17,6 +17,13 @@ def rows() -> dict[str, list[str]]:
     """The cells of each method's row."""
     lines = [line.strip("|").split("|") for line in table("humanoid").splitlines()[2:]]
     return {name.strip(): [cell.strip() for cell in cells] for name, *cells in lines}
+
+
+def test_an_unknown_task_is_told(monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["parameters.py", "nosuch"])
+    with pytest.raises(SystemExit):
+        main()
+    assert "invalid choice: 'nosuch'" in capsys.readouterr().err
 
 
 def test_every_ratio_of_the_papers_table_is_reproduced(rows):

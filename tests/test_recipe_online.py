@@ -18,6 +18,7 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
 from agents import configured
+from help_text import file_name
 from online_mujoco import train
 from recipe_cases import (
     CONFIGS,
@@ -180,6 +181,24 @@ def test_a_variant_belongs_to_rlpd_and_stays_that_of_the_run(tmp_path):
         resumed_config(composed("algo=rlpd", *typed), typed)
 
 
+def test_the_choice_of_another_method_with_the_same_loss_is_told_on_resume(tmp_path):
+    run_dir = train(
+        composed(*TINY["rlpd"], f"run_dir={tmp_path / 'here'}", "optim.total_updates=2")
+    )
+    kept = [word for word in TINY["rlpd"] if word.startswith("rlpd.")]
+    typed = [f"resume={run_dir}", "algo=rlpd_wsrl", *kept]
+    with pytest.raises(RunError, match="algo=... chooses has rlpd.actor_layer_norm=True, but"):
+        resumed_config(composed(*typed), typed)
+    typed = [f"resume={run_dir}", "algo=rlpd", *kept]
+    assert resumed_config(composed(*typed), typed)[0].rlpd == composed(*TINY["rlpd"]).rlpd
+
+
+def test_a_run_of_the_other_recipe_is_told_on_resume(unbroken):
+    typed = [f"resume={unbroken}"]
+    with pytest.raises(RunError, match="a run of another recipe, .* has the key dataset"):
+        resumed_config(composed("algo=sac", *typed, name="o2o_halfcheetah"), typed)
+
+
 def test_wandb_without_login_is_refused(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("NETRC", str(tmp_path / "netrc"))
@@ -319,6 +338,14 @@ def test_multirun_names_its_jobs_by_their_overrides(tmp_path):
         assert f"seed={seed}" in job.name
         assert OmegaConf.load(job / "config.yaml").seed == seed
         assert list_checkpoints(job / "checkpoints")
+
+
+def test_the_name_of_a_job_with_many_overrides_is_cut():
+    short, long = "a=1,b=2", ",".join(f"aca.number_{i}=0.125" for i in range(40))
+    assert file_name(short) == short
+    one, two = file_name(f"{long},seed=0"), file_name(f"{long},seed=1")
+    assert len(one) == len(two) < 255 and one.startswith("aca.number_0=0.125,aca.number_1=")
+    assert one.endswith(",seed=0") and two.endswith(",seed=1") and one[:-7] != two[:-7]
 
 
 def test_total_updates_and_logger_may_change_on_resume(unbroken):

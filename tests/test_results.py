@@ -124,6 +124,8 @@ def test_command_writes_the_figure_and_prints_the_table(tmp_path):
     printed = subprocess.run(typed, capture_output=True, text=True, check=True).stdout
     assert "| 10 | 2 (2, 3) |" in printed
     assert "<!-- mean of the data -->" in figure.read_text()
+    wrong = subprocess.run([*typed[:-1], "foo"], capture_output=True, text=True, check=False)
+    assert "expected NAME=RETURN, got 'foo'" in wrong.stderr
 
 
 def test_a_folder_stands_for_the_runs_in_it_and_one_without_is_told(plot, tmp_path):

@@ -92,7 +92,7 @@ def test_every_study_of_the_package_is_a_valid_one(study, path):
         ("study.settings=['optim.lrr=1']", "aca on InvertedPendulum-v4: .*lrr"),
         ("study.name=a/b", "study.name='a/b': expected"),
         ("study.seeds=[]", r"study.seeds=\[\]: expected"),
-        ("launcher.jobs=0", "launcher.local.jobs=0: expected greater than"),
+        ("launcher.jobs=0", "launcher.jobs=0: expected greater than"),
     ],
 )
 def test_a_mistake_in_any_job_is_told_before_the_first_one_starts(study, override, message):
@@ -138,6 +138,17 @@ def test_a_part_of_a_study_leaves_the_names_of_the_rest(tmp_path):
     other = checked(StudyConfig, composed("study=table2", f"dir={tmp_path}", name="study"))
     with pytest.raises(RunError, match="holds the study tiny"):
         write_study(other)
+
+
+@pytest.mark.parametrize("content", ["a: [", "", "name: tiny"])
+def test_a_directory_that_cannot_be_used_is_told(tmp_path, content):
+    cfg = checked(StudyConfig, composed("study=tiny", f"dir={tmp_path}", name="study"))
+    (tmp_path / "study.yaml").write_text(content)
+    with pytest.raises(RunError, match="study.yaml is damaged; expected name, tasks and methods"):
+        write_study(cfg)
+    cfg.dir = str(tmp_path / "study.yaml")
+    with pytest.raises(RunError, match="study.yaml cannot be used: .*exists"):
+        write_study(cfg)
 
 
 def test_parts_that_begin_at_the_same_time_lose_no_name(tmp_path):

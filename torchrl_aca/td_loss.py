@@ -101,7 +101,8 @@ class TDLoss(LossModule):
         # A terminal state may hold anything, NaN included: its value is zero, not zero times that.
         next_value = next_value.masked_fill(data[terminated].reshape(next_value.shape), 0.0)
         data.set(next_key(read.value), next_value)
-        return self.value_estimator.value_estimate(data).reshape(next_value.shape)
+        target = self.value_estimator.value_estimate(data).reshape(next_value.shape)
+        return target.to(next_value.dtype)  # rewards may be float64; torch < 2.13 would not learn
 
     def _output(
         self,

@@ -13,7 +13,7 @@ import hydra
 from filelock import FileLock
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from pydantic import Field
 
 from agents import configured
@@ -21,6 +21,7 @@ from data.config import OfflineToOnlineConfig
 from torchrl_aca.errors import RunError
 from torchrl_aca.training.config import Count, RunConfig, Section, Seed, override
 from torchrl_aca.training.files import write_text
+from torchrl_aca.training.resume import read_yaml
 
 FOLDER = Path(__file__).parents[1]
 
@@ -174,17 +175,31 @@ def write_study(cfg: StudyConfig) -> None:
     """Keeps what the study is in its directory, with the tasks and methods of earlier calls.
 
     Raises:
-        RunError: If the directory is that of another study.
+        RunError: If the directory is that of another study, or cannot be read or written.
     """
     path, study = study_dir(cfg) / "study.yaml", OmegaConf.create(cfg.study.model_dump())
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with FileLock(path.with_name(".study.lock")):  # parts may be begun at the same time
-        if path.exists():
-            found = OmegaConf.load(path)
-            if found.name != study.name:
-                raise RunError(
-                    f"dir={path.parent} holds the study {found.name}; expected a new directory."
-                )
-            for key in ("tasks", "methods"):  # a part of a study may be run on its own
-                study[key] = {**found[key], **study[key]}
-        write_text(path, OmegaConf.to_yaml(study))
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with FileLock(path.with_name(".study.lock")):  # parts may be begun at the same time
+            if path.exists():
+                found = _read_study(path)
+                if found.name != study.name:
+                    raise RunError(
+                        f"dir={path.parent} holds the study {found.name}; expected a new directory."
+                    )
+                for key in ("tasks", "methods"):  # a part of a study may be run on its own
+                    study[key] = {**found[key], **study[key]}
+            write_text(path, OmegaConf.to_yaml(study))
+    except OSError as error:
+        raise RunError(f"dir={path.parent} cannot be used: {error}. Give another one.") from error
+
+
+def _read_study(path: Path) -> DictConfig:
+    """What an earlier call has kept."""
+    found = read_yaml(path)
+    if found is None or not {"name", "tasks", "methods"} <= found.keys():
+        raise RunError(
+            f"{path} is damaged; expected name, tasks and methods of a study. Remove the file: the "
+            "runs beside it stay, and this command writes it anew."
+        )
+    return found

@@ -98,7 +98,12 @@ class DatasetWriter:
                 f"{self.staging} is in the way, and no writer has made it. Move it, or choose "
                 "another path."
             )
-        self.staging.mkdir(parents=True)
+        try:
+            self.staging.mkdir(parents=True)
+        except OSError as error:
+            raise DatasetError(
+                f"{self.path} cannot be made: {error}. Choose another path."
+            ) from error
         self._owner.write_text(self._token)
         (self.staging / "next").mkdir()
         for key in self.layout:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from typing import Annotated, Any, Literal, NoReturn, TypeVar
 
 from omegaconf import DictConfig, OmegaConf
@@ -199,7 +200,8 @@ def checked(schema: type[Schema], cfg: DictConfig | dict[str, Any]) -> Schema:
     try:
         return schema.model_validate(values)
     except ValidationError as error:
-        raise RunError("\n       ".join(dict.fromkeys(map(_told, error.errors())))) from None
+        told = dict.fromkeys(_told(each, values) for each in error.errors())
+        raise RunError("\n       ".join(told)) from None
 
 
 def override(key: str, value: object) -> str:
@@ -216,13 +218,14 @@ def override(key: str, value: object) -> str:
     return f'{key}="{escaped}"'
 
 
-def _told(error: ErrorDetails) -> str:
+def _told(error: ErrorDetails, values: Any) -> str:
     """One mistake in one sentence: key, got, expected."""
     context = error.get("ctx", {})
-    place = [str(part) for part in error["loc"] if part != "[key]"]
+    place = _place(error["loc"], values)
     key = ".".join([*place, context["key"]] if "key" in context else place)
     value = context.get("value", error["input"])
     if error["type"] == "missing":
+        key = ".".join([*place, str(error["loc"][-1])])
         return f"{key} is missing from the configuration. Give it with {key}=... ."
     if error["type"] == "extra_forbidden":
         return f"{key}={value!r}: there is no such key. Leave it out, or correct its name."
@@ -230,3 +233,14 @@ def _told(error: ErrorDetails) -> str:
         return f"{key}={value!r}: expected a section with keys of its own, as {key}.KEY=... ."
     expected = re.sub(r"^Input should be |^List should have | after validation.*", "", error["msg"])
     return f"{key}={value!r}: expected {expected}. Set it with {key}=... ."
+
+
+def _place(location: Sequence[int | str], values: Any) -> list[str]:
+    """The keys of a mistake's place, which also tells which of several types was tried."""
+    place = []
+    for part in location:
+        entries = dict(enumerate(values)) if isinstance(values, list) else values
+        if isinstance(entries, dict) and part in entries:
+            values = entries[part]
+            place.append(str(part))
+    return place

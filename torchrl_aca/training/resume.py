@@ -10,6 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_aca.errors import RunError
 from torchrl_aca.training.checkpoint import read_checkpoint
+from torchrl_aca.training.config import RunConfig
 from torchrl_aca.training.due import has_reached
 from torchrl_aca.training.files import read_csv
 from torchrl_aca.training.run_dir import DONE
@@ -42,6 +43,7 @@ def resumed_config(cfg: DictConfig, overrides: Iterable[str]) -> tuple[DictConfi
     run_dir = Path(cfg.resume)
     checkpoint = read_checkpoint(run_dir)
     run = OmegaConf.create(checkpoint["config"])
+    _require_same_recipe(cfg, run, run_dir)
     stored = read_config(run_dir)
     if stored is not None:
         require_equal(stored, run, stored, f"{run_dir / 'config.yaml'}")
@@ -104,8 +106,13 @@ def read_evaluations(run_dir: Path) -> list[dict[str, float]]:
 
 def read_config(run_dir: Path) -> DictConfig | None:
     """Returns a run directory's config.yaml, or None where it is missing, empty or damaged."""
+    return read_yaml(run_dir / "config.yaml")
+
+
+def read_yaml(path: Path) -> DictConfig | None:
+    """Returns what a YAML file holds by name, or None where it is missing, empty or damaged."""
     try:
-        stored = OmegaConf.load(run_dir / "config.yaml")
+        stored = OmegaConf.load(path)
     except Exception:  # what a YAML parser raises depends on the foreign bytes
         return None
     return stored if isinstance(stored, DictConfig) and stored else None
@@ -123,11 +130,30 @@ def apply_overrides(run: DictConfig, cfg: DictConfig, overrides: Iterable[str]) 
         RunError: If an override would change what the run is.
     """
     typed = {override.split("=")[0].lstrip("+~") for override in overrides} - {"resume"}
+    if "algo" in typed:  # which chooses a method's own sections as well
+        for key in sorted(_sections(run) & _sections(cfg) - RunConfig.model_fields.keys()):
+            require_equal(cfg, run, cfg[key], "the method that algo=... chooses", f"{key}.")
     for key in sorted(typed):
         part = OmegaConf.create({})
         OmegaConf.update(part, key, OmegaConf.select(cfg, key))
         require_equal(part, run, part, "the command line")
         OmegaConf.update(run, key, OmegaConf.select(cfg, key))
+
+
+def _sections(cfg: DictConfig) -> set[str]:
+    return {
+        str(key) for key, value in OmegaConf.to_container(cfg).items() if isinstance(value, dict)
+    }
+
+
+def _require_same_recipe(cfg: DictConfig, run: DictConfig, run_dir: Path) -> None:
+    """Raises `RunError` where a recipe has keys, sections aside, that the run has not, or less."""
+    plain, made_with = (set(each) - _sections(each) for each in (cfg, run))
+    if other := sorted((plain ^ made_with) - {"existing"} - _sections(cfg) - _sections(run)):
+        raise RunError(
+            f"{run_dir} is a run of another recipe, or of an earlier version of this one: only one "
+            f"of the two has the key {other[0]}. Go on with the script that made it."
+        )
 
 
 def require_equal(
@@ -149,5 +175,5 @@ def require_equal(
             raise RunError(
                 f"{where} has {key}={value}, but the run to resume has "
                 f"{key}={OmegaConf.select(run, key)}. Only {', '.join(MAY_CHANGE_ON_RESUME)} may "
-                f"change: leave {key} out, or start a new run without resume=."
+                "change: leave that out, or start a new run without resume=."
             )
