@@ -65,7 +65,7 @@ bench: $(INSTALLED)  ## measure speed and write results/speed.md (THREADS=2, OUT
 	@$(VENV) benchmarks/report.py "$(CACHE)/speed.json" "$(OUT)"
 
 gpu:  ## on a machine with CUDA, with the torch of PYTHON: tests, speed, a short training -> results/gpu
-	PYTHONPATH="$(CURDIR):recipes:benchmarks:$$PYTHONPATH" $(PYTHON) benchmarks/gpu.py $(ARGS)
+	PYTHONPATH="$(CURDIR):recipes:benchmarks$${PYTHONPATH:+:$$PYTHONPATH}" $(PYTHON) benchmarks/gpu.py $(ARGS)
 
 clean:  ## remove caches and builds, keep .venv and outputs
 	rm -rf .cache docs/_build build dist *.egg-info

@@ -163,8 +163,10 @@ def measure_borders(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 
 def write(rows: Iterator[dict[str, Any]], path: Path) -> list[dict[str, Any]]:
-    """Writes each row as it comes: an interrupt loses none, and no row leaves the old table."""
-    first, written = next(rows), []
+    """Writes each row as it comes: an interrupt leaves those so far, no row the old table."""
+    written: list[dict[str, Any]] = []
+    if (first := next(rows, None)) is None:
+        return written
     path.parent.mkdir(parents=True, exist_ok=True)
     with open(path, "w", newline="") as file:
         writer = csv.DictWriter(file, first.keys())

@@ -21,8 +21,8 @@ from typing import Any
 import hydra
 from omegaconf import DictConfig
 
-import help_text  # noqa: F401
 import renderer  # noqa: F401
+import resolvers  # noqa: F401
 from agents import configured, make_agent
 from agents.pretrained import require_offline_phase, start_from
 from data.config import OfflineToOnlineConfig

@@ -19,8 +19,8 @@ from typing import Any
 import hydra
 from omegaconf import DictConfig
 
-import help_text  # noqa: F401
 import renderer  # noqa: F401
+import resolvers  # noqa: F401
 from agents import configured, make_agent
 from agents.pretrained import refuse_offline_phase
 from torchrl_aca.replay import make_replay_buffer

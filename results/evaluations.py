@@ -113,7 +113,8 @@ def _read_table(source: Path) -> list[Row]:
     """The rows of a study's CSV; that of evaluate.py has the same name and is another one."""
     rows = read_csv(source) if source.is_file() else []
     if not rows or (missing := [name for name in NEEDED if name not in rows[0]]):
-        found = f"none of {missing}" if rows else "no rows"
+        found = "no rows" if source.is_file() else "no file"
+        found = f"one without {', '.join(missing)}" if rows else found
         raise SystemExit(
             f"error: {source}: expected the evaluations.csv of a study, found {found}. Give the "
             "table that report.py has written, or a folder of runs."

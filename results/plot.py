@@ -160,7 +160,9 @@ def main() -> None:
     parser.add_argument("output", type=Path)
     parser.add_argument("run_dirs", type=Path, nargs="+", help="or folders that hold them")
     parser.add_argument("--x", choices=("updates", "frames"), default="updates")
-    parser.add_argument("--line", type=mark, action="append", default=[], help="NAME=RETURN")
+    parser.add_argument(
+        "--line", type=mark, action="append", default=[], help="NAME=RETURN, drawn dashed"
+    )
     arguments = parser.parse_args()
 
     curves = make_curves([run for folder in arguments.run_dirs for run in runs_in(folder)])

@@ -187,11 +187,24 @@ def test_an_update_leaves_its_batch_as_it_is_and_gives_detached_numbers(algo):
 
 
 class RefuseReadingValues(TorchDispatchMode):
-    """Raises where a value of a tensor decides what comes next, which no CUDA graph can record."""
+    """Raises where values decide what comes next or its shape, which no CUDA graph can record."""
+
+    READ = ("_local_scalar_dense", "equal", "nonzero", "masked_select", "_unique2")
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        assert func is not torch.ops.aten._local_scalar_dense.default, "a value was read"
+        masks = args[1] if func is torch.ops.aten.index.Tensor else []
+        read = any(mask is not None and mask.dtype == torch.bool for mask in masks)
+        assert not read and func._opname not in self.READ, f"{func} reads values"
         return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize(
+    "read",
+    [bool, torch.nonzero, lambda x: x[x > 0], lambda x: torch.equal(x, x), torch.Tensor.unique],
+)
+def test_a_read_value_is_noticed(read):
+    with RefuseReadingValues(), pytest.raises(AssertionError, match="reads values"):
+        read(torch.ones(1))
 
 
 @pytest.mark.parametrize("algo", EVERY)

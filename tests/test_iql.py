@@ -151,7 +151,8 @@ def test_the_policy_clips_its_actions_and_scores_what_they_were_before():
     low, high = torch.tensor([-2.0]), torch.tensor([0.5])
     draws = ClippedNormal(loc, torch.full((3, 1), 0.1), low=low, high=high)
     expected = torch.tensor([[0.5], [-2.0], [0.25]])
-    torch.testing.assert_close(draws.deterministic_sample, expected)
+    for action in (draws.deterministic_sample, draws.mean, draws.mode):
+        torch.testing.assert_close(action, expected)
     for sample in (draws.sample(torch.Size([9])), draws.rsample(torch.Size([9]))):
         assert sample.shape == (9, 3, 1)
         assert (sample[:, :2] == expected[:2]).all() and sample[:, 2].std() > 0

@@ -18,7 +18,6 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
 from agents import configured
-from help_text import file_name
 from online_mujoco import train
 from recipe_cases import (
     CONFIGS,
@@ -32,6 +31,7 @@ from recipe_cases import (
     start,
     without_time,
 )
+from resolvers import file_name
 from torchrl_aca.errors import RunError
 from torchrl_aca.training.checkpoint import list_checkpoints
 from torchrl_aca.training.due import updates_due

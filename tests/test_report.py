@@ -243,8 +243,8 @@ def test_half_a_row_of_a_run_at_work_is_none(tmp_path):
         ("study", ["--at", "7"], "no run was evaluated at [7.0] updates"),
         ("study", ["--line", "foo"], "--line 'foo': expected TASK:NAME=VALUE"),
         ("text.csv", [], "expected a number in column note, got 'good'"),
-        ("policy.csv", [], "expected the evaluations.csv of a study, found none of ['method',"),
-        ("missing.csv", [], "expected the evaluations.csv of a study, found no rows"),
+        ("policy.csv", [], "expected the evaluations.csv of a study, found one without method,"),
+        ("missing.csv", [], "expected the evaluations.csv of a study, found no file"),
     ],
 )
 def test_what_cannot_be_reported_is_told_and_nothing_is_written(

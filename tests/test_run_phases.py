@@ -16,14 +16,15 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 from recipe_cases import assert_same_state, rows_of, without_time
 from torchrl_aca.errors import RunError
 from torchrl_aca.replay import TRANSITION_KEYS, MixedReplayBuffer, make_replay_buffer, transitions
+from torchrl_aca.training import run as run_module
 from torchrl_aca.training.agent import Agent
-from torchrl_aca.training.checkpoint import read_checkpoint
+from torchrl_aca.training.checkpoint import list_checkpoints, read_checkpoint
 from torchrl_aca.training.collection import Collection
 from torchrl_aca.training.config import RunConfig, checked
 from torchrl_aca.training.envs import make_vector_env
 from torchrl_aca.training.randomness import seed_everything
 from torchrl_aca.training.run import Run
-from torchrl_aca.training.run_dir import lock
+from torchrl_aca.training.run_dir import DONE, lock
 
 OFFLINE, WARMUP, UPDATES = 30, 40, 40
 SETTINGS = {
@@ -289,3 +290,32 @@ def test_rows_of_a_mixture_are_never_rewritten(tmp_path, monkeypatch):
     with pytest.raises(RunError, match="algo=toy rewrites rows.*got a MixedReplayBuffer"):
         train(tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("writer", ["_save_policy", "save_checkpoint", "write_card", "write_text"])
+def test_a_full_disk_is_told_wherever_the_run_finds_it(writer, tmp_path, monkeypatch):
+    def fail(*args, **kwargs):
+        raise OSError(28, "No space left on device")
+
+    run_dir = tmp_path / "run"
+    if writer == "write_text":  # which writes the configuration first: here, the file `done`
+        real = run_module.write_text
+        monkeypatch.setattr(
+            run_module, writer, lambda path, text: (fail if path.name == DONE else real)(path, text)
+        )
+    else:
+        owner = run_module.Run if writer == "_save_policy" else run_module
+        monkeypatch.setattr(owner, writer, fail)
+    with pytest.raises(RunError, match="run cannot be written: .*No space left.*Make room") as told:
+        train(run_dir)
+    saved = bool(list_checkpoints(run_dir / "checkpoints"))
+    assert saved == (writer in ("write_card", "write_text")) == ("resume=" in str(told.value))
+
+
+def test_an_error_that_is_not_the_disks_is_not_told_as_one(tmp_path, monkeypatch):
+    def fail(*args):
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    monkeypatch.setattr(run_module, "save_checkpoint", fail)
+    with pytest.raises(torch.OutOfMemoryError):
+        train(tmp_path / "run")

@@ -94,3 +94,22 @@ def test_a_terminal_sees_the_warm_up_and_the_evaluation_move(clock, monkeypatch)
     bar.close()
     assert "warm-up 50/100 frames" in shown.getvalue()
     assert "evaluation, step 3" in shown.getvalue()
+
+
+def test_a_terminal_that_has_gone_ends_the_bar_and_not_the_run(monkeypatch):
+    class Gone(io.StringIO):
+        def isatty(self):
+            return True
+
+        def write(self, text):
+            raise OSError(5, "Input/output error")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "stdout", Gone())
+        bar = ProgressBar(10, 0)
+        assert not bar.bar.disable
+        bar.write("a line")
+        assert bar.bar.disable
+        bar.advance(5, "train")
+        bar.write("another line")
+        bar.close()

@@ -194,10 +194,15 @@ def write_study(cfg: StudyConfig) -> None:
         raise RunError(f"dir={path.parent} cannot be used: {error}. Give another one.") from error
 
 
+def _has_sections(cfg: DictConfig, *names: str) -> bool:
+    return all(isinstance(cfg.get(name), DictConfig) for name in names)
+
+
 def _read_study(path: Path) -> DictConfig:
     """What an earlier call has kept."""
+    path.read_bytes()  # where that fails, the file need not be damaged
     found = read_yaml(path)
-    if found is None or not {"name", "tasks", "methods"} <= found.keys():
+    if found is None or "name" not in found or not _has_sections(found, "tasks", "methods"):
         raise RunError(
             f"{path} is damaged; expected name, tasks and methods of a study. Remove the file: the "
             "runs beside it stay, and this command writes it anew."

@@ -55,7 +55,7 @@ def run_job(job: Job, threads: int, stop: StopSignal | None = None) -> int:
 
 
 def run_local(settings: Local, jobs: Sequence[Job], threads: int, stop: StopSignal) -> Results:
-    """On this machine; a signal is passed on to the jobs, which save, and a second one as well."""
+    """On this machine; a signal is passed on to the jobs, which save, a second Ctrl-C as well."""
     num_jobs = settings.jobs or max(1, _num_cores() // threads)
     with ThreadPoolExecutor(num_jobs) as pool:
         try:

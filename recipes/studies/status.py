@@ -16,6 +16,8 @@ from torchrl_aca.training.signals import STOPPED
 
 NAMES = ("done", "running", "stopped", "failed", "left")
 
+HYDRA_HINT = "HYDRA_FULL_ERROR=1"
+
 
 @dataclass(frozen=True)
 class State:
@@ -60,9 +62,6 @@ def _progress(job: Job) -> tuple[int, float]:
         return 0, 0.0
     updates = int(rows[-1]["updates"]) + int(rows[-1].get("offline_updates") or 0)
     return updates, float(rows[-1]["seconds"])
-
-
-HYDRA_HINT = "HYDRA_FULL_ERROR=1"
 
 
 def has_failed(job: Job) -> bool:

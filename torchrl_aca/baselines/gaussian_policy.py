@@ -97,9 +97,14 @@ class ClippedNormal(IndependentNormal):
         return super().sample(torch.Size(sample_shape)).clamp(self.low, self.high)
 
     @property
-    def deterministic_sample(self) -> Tensor:
-        """The clipped mean."""
-        return self.mean.clamp(self.low, self.high)
+    def mean(self) -> Tensor:
+        """The mean, clipped."""
+        return super().mean.clamp(self.low, self.high)
+
+    @property
+    def mode(self) -> Tensor:
+        """The same: where the density is highest within the bounds."""
+        return self.mean
 
 
 class FreeStd(nn.Module):

@@ -104,11 +104,16 @@ class DatasetWriter:
             raise DatasetError(
                 f"{self.path} cannot be made: {error}. Choose another path."
             ) from error
-        self._owner.write_text(self._token)
-        (self.staging / "next").mkdir()
-        for key in self.layout:
-            file = open(self.staging / file_name(key), "wb")  # noqa: SIM115
-            self._files[key] = self._open.enter_context(file)
+        try:
+            self._owner.write_text(self._token)
+            (self.staging / "next").mkdir()
+            for key in self.layout:
+                file = open(self.staging / file_name(key), "wb")  # noqa: SIM115
+                self._files[key] = self._open.enter_context(file)
+        except BaseException:  # Python leaves only what it has entered
+            self._open.close()
+            shutil.rmtree(self.staging)
+            raise
         return self
 
     def __exit__(

@@ -1,4 +1,4 @@
-"""What compiling and CUDA graphs do to the parts of an update."""
+"""What compiling and CUDA graphs do to the parts of an update, and to a policy."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def capture(step: Step, enabled: bool) -> Step:
     it and replays the recorded kernels. On a machine without CUDA calls pass through.
 
     Args:
-        step: A function of a batch of fixed shape, without decisions that depend on values, whose
-            result is detached.
+        step: A function of a batch of fixed shape, such as a policy, without decisions that depend
+            on values, whose result is detached.
         enabled: Whether to capture.
     """
     return CudaGraphModule(step, in_keys=[], out_keys=[], warmup=WARMUP) if enabled else step

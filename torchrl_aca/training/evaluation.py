@@ -79,7 +79,7 @@ def evaluate(
         env.set_seed(seed)
         data = env.reset()
         while alive.any():
-            data = policy(data.to(device)).cpu()
+            data = policy(data.to(device)).to(env.device or "cpu")
             data, following = env.step_and_maybe_reset(data)
             returns += data["next", "reward"].squeeze(-1).cpu() * alive
             lengths += alive

@@ -16,13 +16,19 @@ import torch
 def replace_file(path: Path, write: Callable[[BinaryIO], object]) -> None:
     """Writes a file under a temporary name and renames it when it is complete.
 
-    A crash, a kill or a full disk in between leaves what stood there before; a kill, or a second
-    signal, the temporary file as well.
+    A crash, a kill or a full disk in between leaves what stood there before; a kill the temporary
+    file as well.
+
+    Raises:
+        OSError: If the disk is full or broken.
     """
     temporary = path.with_name(f"{path.name}.tmp")
     try:
         with open(temporary, "wb") as file:
-            write(file)
+            try:
+                write(file)
+            except RuntimeError as error:  # torch's own of a full disk
+                raise OSError(f"{path}: {error}") from error
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 
 from tqdm import tqdm
 
 SHOWN = ("return", "loss")
 REFRESH = 0.2  # seconds between two changes of the bar's description
+UNREADABLE = (OSError, RuntimeError, ValueError)  # gone, within another line, no such letter
 
 
 def say(message: str) -> None:
@@ -22,8 +24,9 @@ def say(message: str) -> None:
     try:
         print(message, flush=True)
     except BrokenPipeError:  # or Python fails again when it ends, and has another exit status
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except (OSError, RuntimeError):
+        with suppress(*UNREADABLE), open(os.devnull, "w") as nowhere:
+            os.dup2(nowhere.fileno(), sys.stdout.fileno())
+    except UNREADABLE:
         pass
 
 
@@ -96,12 +99,12 @@ class ProgressBar:
         if estimate := self.pace.first_estimate(self.total):
             self.write(estimate)
         self.describe(activity)
-        self.bar.update(updates - self.bar.n)
+        self._change(lambda: self.bar.update(updates - self.bar.n))
 
     def describe(self, activity: str) -> None:
         """Says what is going on, in front of the bar."""
         if time.monotonic() - self._refreshed > REFRESH:
-            self.bar.set_description_str(activity)
+            self._change(lambda: self.bar.set_description_str(activity))
             self._refreshed = time.monotonic()
 
     def show_metrics(self, updates: int, frames: int, values: Mapping[str, float]) -> None:
@@ -125,14 +128,21 @@ class ProgressBar:
 
     def write(self, message: str) -> None:
         """Prints a line above the bar."""
+        if not self.bar.disable:
+            self._change(lambda: self.bar.write(message))
         if self.bar.disable:
             say(message)
-        else:
-            self.bar.write(message)
 
     def close(self) -> None:
         """Leaves the bar as it stands."""
-        self.bar.close()
+        self._change(self.bar.close)
+
+    def _change(self, change: Callable[[], object]) -> None:
+        """Changes what is on the terminal; where that has gone, there is no bar any more."""
+        try:
+            change()
+        except UNREADABLE:
+            self.bar.disable = True
 
 
 def _status(values: Mapping[str, float]) -> str:

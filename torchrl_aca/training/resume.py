@@ -132,7 +132,9 @@ def apply_overrides(run: DictConfig, cfg: DictConfig, overrides: Iterable[str]) 
     typed = {override.split("=")[0].lstrip("+~") for override in overrides} - {"resume"}
     if "algo" in typed:  # which chooses a method's own sections as well
         for key in sorted(_sections(run) & _sections(cfg) - RunConfig.model_fields.keys()):
-            require_equal(cfg, run, cfg[key], "the method that algo=... chooses", f"{key}.")
+            where = "what algo=... chooses"
+            mend = "leave algo=... out, or type the run's settings beside it"
+            require_equal(cfg, run, cfg[key], where, f"{key}.", mend)
     for key in sorted(typed):
         part = OmegaConf.create({})
         OmegaConf.update(part, key, OmegaConf.select(cfg, key))
@@ -157,7 +159,12 @@ def _require_same_recipe(cfg: DictConfig, run: DictConfig, run_dir: Path) -> Non
 
 
 def require_equal(
-    new: DictConfig, run: DictConfig, keys: DictConfig, where: str, prefix: str = ""
+    new: DictConfig,
+    run: DictConfig,
+    keys: DictConfig,
+    where: str,
+    prefix: str = "",
+    mend: str = "leave that out",
 ) -> None:
     """Compares the entries of `keys` in two configurations, but for those that may change.
 
@@ -170,10 +177,10 @@ def require_equal(
             continue
         value = OmegaConf.select(new, key)
         if isinstance(value, DictConfig):
-            require_equal(new, run, value, where, f"{key}.")
+            require_equal(new, run, value, where, f"{key}.", mend)
         elif value != OmegaConf.select(run, key):
             raise RunError(
                 f"{where} has {key}={value}, but the run to resume has "
                 f"{key}={OmegaConf.select(run, key)}. Only {', '.join(MAY_CHANGE_ON_RESUME)} may "
-                "change: leave that out, or start a new run without resume=."
+                f"change: {mend}, or start a new run without resume=."
             )

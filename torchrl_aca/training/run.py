@@ -6,6 +6,7 @@ import json
 import shlex
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
@@ -17,7 +18,7 @@ from tensordict import TensorDictBase
 from torchrl_aca.errors import RunError
 from torchrl_aca.replay import write_back
 from torchrl_aca.training.agent import Agent
-from torchrl_aca.training.checkpoint import Counters, save_checkpoint
+from torchrl_aca.training.checkpoint import Counters, list_checkpoints, save_checkpoint
 from torchrl_aca.training.collection import BadDataError, Collection
 from torchrl_aca.training.config import RunConfig, override
 from torchrl_aca.training.due import has_reached, is_better, passed, updates_due
@@ -224,7 +225,8 @@ class Run:
         if passed(cfg.eval.interval, since, now) or last:
             self.log_evaluation()
         if now == last_offline:  # before the checkpoint, after which the phase is not made again
-            save_pretrained(self.dir, self.parts, self.config, self.facts)
+            with self._writing():
+                save_pretrained(self.dir, self.parts, self.config, self.facts)
         if passed(cfg.checkpoint.interval, since, now) or now == last_offline:
             self.save()
         if now == last_offline:  # another phase, another speed
@@ -245,7 +247,8 @@ class Run:
     def log_metrics(self) -> None:
         """Adds a row of training metrics, with the time and the speed."""
         values = {**self.collection.episodes.metrics(), **self.means.pop(), **self._speed()}
-        self.logger.log("metrics", self._axes(), self.counters.total, values)
+        with self._writing():
+            self.logger.log("metrics", self._axes(), self.counters.total, values)
         self.bar.show_metrics(self.counters.total, self.collection.frames, values)
 
     def log_evaluation(self) -> None:
@@ -253,12 +256,14 @@ class Run:
         self._signal.activity = "evaluation"
         values = self._evaluate(lambda step: self.bar.describe(f"evaluation, step {step}"))
         self._signal.activity = "iteration"
-        self.logger.log("eval", self._axes(), self.counters.total, values)
+        with self._writing():
+            self.logger.log("eval", self._axes(), self.counters.total, values)
         best = max(float(row["return_mean"]) for row in self.logger.tables["eval"].rows)
         self.bar.show_evaluation(self.counters.total, self.collection.frames, values, best)
         if self.cfg.checkpoint.keep_best and is_better(values["return_mean"], self._best):
             self._best = values["return_mean"]
-            self._save_policy("best", {**self._axes(), **values})
+            with self._writing():
+                self._save_policy("best", {**self._axes(), **values})
 
     def _speed(self) -> dict[str, float]:
         then, updates, frames = self._lap
@@ -275,16 +280,21 @@ class Run:
         """Writes a checkpoint of all parts."""
         directory, keep_last = self.dir / "checkpoints", self.cfg.checkpoint.keep_last
         updates = self.counters.total
-        try:
+        with self._writing():
             self._save_policy(updates)  # first, so that no checkpoint is without one
             path = save_checkpoint(directory, self.parts, self.config, updates, keep_last)
-        except (OSError, RuntimeError) as error:  # torch's own where the disk is full
-            raise RunError(
-                f"{directory} cannot be written: {error}. Make room; what was saved before is "
-                f"whole: {override('resume', self.dir)}."
-            ) from error
         self._saved = (updates, self.collection.frames)
         return path
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        """Tells of a full or broken disk in one message."""
+        try:
+            yield
+        except OSError as error:
+            whole = list_checkpoints(self.dir / "checkpoints")
+            go_on = f"; then go on with {override('resume', self.dir)}" if whole else ""
+            raise RunError(f"{self.dir} cannot be written: {error}. Make room{go_on}.") from error
 
     def _save_policy(
         self, which: int | Literal["best"], evaluation: Mapping[str, float] | None = None
@@ -314,25 +324,28 @@ class Run:
             error = second
             raise
         finally:
-            if isinstance(error, KeyboardInterrupt):
-                self._tell_stop("at once", "go on from the newest checkpoint")
-            self._signal.__exit__()
-            self.bar.close()
-            self.logger.close()
-            self.collection.close()
-            self._lock.release()
+            try:
+                if isinstance(error, KeyboardInterrupt) and not (self.dir / DONE).exists():
+                    self._tell_stop("at once", "go on from the newest checkpoint")
+            finally:
+                self._signal.__exit__()
+                self.bar.close()
+                self.logger.close()
+                self.collection.close()
+                self._lock.release()
         return isinstance(error, _Stopped)
 
     def _finish(self) -> None:
         self._speed()
         if self._saved != (self.counters.total, self.collection.frames):
             self.save()
-        if self.completed:  # at once after the checkpoint: a kill from here on costs no update
-            write_text(self.dir / DONE, f"{self.counters.updates}\n")
         rows = self.logger.tables["eval"].rows
         title = f"{self.cfg.algo.name} on {self.cfg.env.name}"
-        write_card(self.dir, self.config, self._axes(), rows, self.counters.seconds, self.facts)
-        plot_curve(self.dir, title, rows)
+        with self._writing():
+            if self.completed:  # at once after the checkpoint: a kill from here costs no update
+                write_text(self.dir / DONE, f"{self.counters.updates}\n")
+            write_card(self.dir, self.config, self._axes(), rows, self.counters.seconds, self.facts)
+            plot_curve(self.dir, title, rows)
         if self.completed:
             before, after = (float(row["return_mean"]) for row in (rows[0], rows[-1]))
             self.bar.write(f"mean evaluation return: before {before:.1f}, after {after:.1f}")

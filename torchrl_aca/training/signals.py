@@ -33,16 +33,16 @@ class StopSignal:
         signal.SIGTERM: signal.SIG_DFL,
     }
 
-    def __init__(self, say: Callable[[str], None] = say) -> None:
+    def __init__(self, tell: Callable[[str], None] = say) -> None:
         """Does nothing until it is entered.
 
         Args:
-            say: Shows a line to the user; called at once when a signal arrives.
+            tell: Shows a line to the user; called at once when a signal arrives.
         """
         self.received: str | None = None
         self.at_once = False
         self.activity = "iteration"
-        self._say = say
+        self._tell = tell
 
     def __enter__(self) -> StopSignal:
         """Installs the handlers."""
@@ -61,7 +61,7 @@ class StopSignal:
         time.sleep(TWINS)
         for each, handler in self.AT_ONCE.items():
             signal.signal(each, handler)
-        self._say(f"{self.received}: stopping after this {self.activity}; Ctrl-C again quits")
+        self._tell(f"{self.received}: stopping after this {self.activity}; Ctrl-C again quits")
 
 
 def run_command(command: Sequence[str], stop: StopSignal, **options: Any) -> int:
@@ -69,7 +69,7 @@ def run_command(command: Sequence[str], stop: StopSignal, **options: Any) -> int
 
     Args:
         command: A program and its arguments.
-        stop: The wish to stop; the program gets it as SIGTERM, and as a second one `at_once`.
+        stop: The wish to stop; the program gets it as SIGTERM, and as more of them `at_once`.
         options: For `subprocess.Popen`.
 
     Returns:
@@ -78,12 +78,12 @@ def run_command(command: Sequence[str], stop: StopSignal, **options: Any) -> int
     """
     # A session of its own: Ctrl-C reaches it once, through this process.
     process = subprocess.Popen(command, start_new_session=True, **options)
-    told = 0
+    told = False
     try:
         while True:
-            if told < bool(stop.received) + stop.at_once:
+            if stop.received and (stop.at_once or not told):
                 process.terminate()
-                told += 1
+                told = True
             try:
                 code = process.wait(timeout=0.2)
                 return STOPPED if told and code == -signal.SIGTERM else code
