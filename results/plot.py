@@ -24,7 +24,7 @@ from typing import Any
 from matplotlib.axes import Axes
 from omegaconf import OmegaConf
 
-from curves import draw_marks, draw_mean, make_panels, shared
+from curves import draw_legends, draw_marks, draw_mean, make_panels, shared
 from evaluations import read_evaluations
 
 # Not what a run is.
@@ -109,19 +109,21 @@ def make_curves(run_dirs: Sequence[Path]) -> list[Curve]:
 
 def labels(curves: Sequence[Curve]) -> list[str]:
     """What the curves are called; with a directory's name where that alone tells two apart."""
-    plain = [curve.label for curve in curves]
-    names = [curve.runs[0].dir.name for curve in curves]
-    return [f"{x} ({n})" if plain.count(x) > 1 else x for x, n in zip(plain, names, strict=True)]
+    plain = [(curve.runs[0].task, curve.label) for curve in curves]
+    return [
+        f"{curve.label} ({curve.runs[0].dir.name})" if plain.count(each) > 1 else curve.label
+        for curve, each in zip(curves, plain, strict=True)
+    ]
 
 
-def draw(axes: Axes, curve: Curve, label: str, x: str = "updates") -> None:
+def draw(axes: Axes, curve: Curve, label: str, color: str, x: str = "updates") -> None:
     """Adds a curve to a panel."""
-    line = draw_mean(axes, label, [run.returns(x) for run in curve.runs])
+    line = draw_mean(axes, label, [run.returns(x) for run in curve.runs], color)
     if len(curve.runs) == 1:
         places, values = line.get_xdata(), line.get_ydata()
         stds = curve.runs[0].returns(x, "return_std").values()
         low, high = zip(*((v - s, v + s) for v, s in zip(values, stds, strict=True)), strict=True)
-        axes.fill_between(places, low, high, alpha=0.15, color=line.get_color(), linewidth=0)
+        axes.fill_between(places, low, high, alpha=0.15, color=color, linewidth=0)
 
 
 def unit(curves: Sequence[Curve]) -> str:
@@ -169,11 +171,13 @@ def main() -> None:
     tasks = sorted({curve.runs[0].task for curve in curves})
     xlabel = unit(curves) if arguments.x == "updates" else "environment frames"
     figure, panels = make_panels(tasks, xlabel)
-    for curve, label in zip(curves, labels(curves), strict=True):
-        draw(panels[curve.runs[0].task], curve, label, arguments.x)
+    called = labels(curves)
+    colors = {label: f"C{number}" for number, label in enumerate(dict.fromkeys(called))}
+    for curve, label in zip(curves, called, strict=True):
+        draw(panels[curve.runs[0].task], curve, label, colors[label], arguments.x)
     for axes in panels.values():
         draw_marks(axes, dict(arguments.line))
-        axes.legend(frameon=False)
+    draw_legends(figure)
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(arguments.output, dpi=150)
     for task in tasks:

@@ -25,7 +25,7 @@ from pathlib import Path
 
 import numpy as np
 
-from curves import draw_marks, draw_mean, make_panels
+from curves import draw_legends, draw_marks, draw_mean, make_panels
 from evaluations import (
     COLUMNS,
     Row,
@@ -156,11 +156,11 @@ def draw_curves(rows: Sequence[Row], path: Path, labels: tuple[str, str], lines:
     """A panel for each task: the mean over seeds and its interval."""
     figure, panels = make_panels(names(rows, "task"), *labels)
     for task, axes in panels.items():
-        for method in names(rows, "method"):
+        for number, method in enumerate(names(rows, "method")):
             if runs := list(by_seed(rows, task, method).values()):
-                draw_mean(axes, f"{method}, n={len(runs)}", runs)
+                draw_mean(axes, f"{method}, n={len(runs)}", runs, f"C{number}")
         draw_marks(axes, lines.get(task, {}))
-        axes.legend(frameon=False, fontsize="small")
+    draw_legends(figure)
     figure.savefig(path, dpi=120)
 
 

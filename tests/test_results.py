@@ -76,7 +76,7 @@ def test_a_curve_is_its_mean_with_an_interval_over_seeds_or_episodes(plot, tmp_p
         (runs[:1], [1.0, 2.0], (1.0, 3.0)),
     ):
         axes = Figure().subplots()
-        plot.draw(axes, *plot.make_curves(run_dirs), "both")
+        plot.draw(axes, *plot.make_curves(run_dirs), "both", "C1")
         assert [line.get_ydata().tolist() for line in axes.lines] == [values]
         at_ten = [y for x, y in axes.collections[0].get_paths()[0].vertices if x == 10]
         assert (min(at_ten), max(at_ten)) == band
@@ -86,7 +86,7 @@ def test_what_a_longer_run_has_beyond_the_others_is_dotted(plot, tmp_path):
     longer = write_run(tmp_path / "longer", {0: 1.0, 10: 2.0, 20: 5.0, 30: 6.0}, seed=0)
     shorter = write_run(tmp_path / "shorter", {0: 3.0, 10: 4.0}, seed=1)
     axes = Figure().subplots()
-    plot.draw(axes, *plot.make_curves([longer, shorter]), "both")
+    plot.draw(axes, *plot.make_curves([longer, shorter]), "both", "C1")
     mean, beyond = axes.lines
     assert (mean.get_xdata().tolist(), mean.get_ydata().tolist()) == ([0, 10], [2.0, 3.0])
     assert (list(beyond.get_xdata()), list(beyond.get_ydata())) == ([10, 20, 30], [2.0, 5.0, 6.0])
@@ -106,6 +106,26 @@ def test_each_task_has_a_panel_and_frames_may_be_the_axis(plot, tmp_path, monkey
     assert [axes.get_title() for axes in drawn] == ["A-v1", "B-v1"]
     assert [axes.lines[0].get_xdata().tolist() for axes in drawn] == [[0, 70], [0, 70]]
     assert "A-v1\n| updates" in capsys.readouterr().out
+
+
+def test_many_curves_have_one_legend_and_a_colour_each_in_all_panels(plot, tmp_path, monkeypatch):
+    methods = [f"m{number}" for number in range(6)]
+    for task in ("A-v1", "B-v1"):
+        for method in methods[task == "B-v1" :]:  # the second task lacks the first method
+            algo, path = {"name": method}, tmp_path / f"{task}-{method}"
+            write_run(path, {0: 1.0, 10: 2.0}, env={"name": task}, algo=algo)
+    drawn = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
+    for folder in (tmp_path, tmp_path / "A-v1-m0"):
+        monkeypatch.setattr(sys, "argv", ["plot.py", str(tmp_path / "out.png"), str(folder)])
+        plot.main()
+    many, one = drawn
+    assert [text.get_text()[:2] for text in many.legends[0].get_texts()] == methods
+    first, second = many.axes
+    assert first.get_legend() is None is second.get_legend()
+    assert [line.get_color() for line in first.lines] == [f"C{number}" for number in range(6)]
+    assert [line.get_color() for line in second.lines] == [f"C{number}" for number in range(1, 6)]
+    assert not one.legends and one.axes[0].get_legend() is not None
 
 
 def test_updates_of_an_offline_phase_come_before_zero(plot, tmp_path):
