@@ -40,15 +40,11 @@ def run(cfg: StudyConfig) -> int:
     failed = 0
     with StopSignal() as stop:
         stop.activity = "iteration of each job"
-        try:
-            for job, code in launch_jobs(cfg, open_jobs, stop):
-                outcome = {0: "done", STOPPED: "stopped"}.get(code, f"failed with status {code}")
-                why = f": {last_line(job)}" if code else ""
-                say(f"{job.dir.name} {outcome}{why}")
-                failed += code not in (0, STOPPED)
-        except KeyboardInterrupt:  # here and not within a launcher, which waits for its jobs
-            stop.at_once = True
-            raise
+        for job, code in launch_jobs(cfg, open_jobs, stop):
+            outcome = {0: "done", STOPPED: "stopped"}.get(code, f"failed with status {code}")
+            why = f": {last_line(job)}" if code else ""
+            say(f"{job.dir.name} {outcome}{why}")
+            failed += code not in (0, STOPPED)
     say(status_table(jobs).splitlines()[-1])
     if stop.received:
         raise SystemExit(STOPPED)

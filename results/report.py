@@ -156,9 +156,9 @@ def draw_curves(rows: Sequence[Row], path: Path, labels: tuple[str, str], lines:
     """A panel for each task: the mean over seeds and its interval."""
     figure, panels = make_panels(names(rows, "task"), *labels)
     for task, axes in panels.items():
-        for number, method in enumerate(names(rows, "method")):
+        for index, method in enumerate(names(rows, "method")):
             if runs := list(by_seed(rows, task, method).values()):
-                draw_mean(axes, f"{method}, n={len(runs)}", runs, f"C{number}")
+                draw_mean(axes, f"{method}, n={len(runs)}", runs, f"C{index}")
         draw_marks(axes, lines.get(task, {}))
     draw_legends(figure)
     figure.savefig(path, dpi=120)

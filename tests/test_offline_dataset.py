@@ -160,11 +160,9 @@ def test_of_two_writers_with_one_path_the_second_one_finishes(tmp_path):
 
 def test_a_path_that_cannot_be_made_is_told(tmp_path):
     (tmp_path / "file").touch()
-    with (
-        pytest.raises(DatasetError, match="file/data cannot be made: .*Choose another path"),
-        DatasetWriter(tmp_path / "file" / "data", 3, 2),
-    ):
-        pass
+    writer = DatasetWriter(tmp_path / "file" / "data", OBSERVATION_DIM, ACTION_DIM)
+    with pytest.raises(DatasetError, match="file/data cannot be made: .*Choose another path"):
+        writer.__enter__()
 
 
 def test_a_directory_of_another_program_is_left_alone(tmp_path):

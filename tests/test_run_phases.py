@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import signal
 from pathlib import Path
@@ -292,7 +293,7 @@ def test_rows_of_a_mixture_are_never_rewritten(tmp_path, monkeypatch):
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("writer", ["_save_policy", "save_checkpoint", "write_card", "write_text"])
+@pytest.mark.parametrize("writer", ["save_policy", "save_checkpoint", "write_card", "write_text"])
 def test_a_full_disk_is_told_wherever_the_run_finds_it(writer, tmp_path, monkeypatch):
     def fail(*args, **kwargs):
         raise OSError(28, "No space left on device")
@@ -304,8 +305,10 @@ def test_a_full_disk_is_told_wherever_the_run_finds_it(writer, tmp_path, monkeyp
             run_module, writer, lambda path, text: (fail if path.name == DONE else real)(path, text)
         )
     else:
-        owner = run_module.Run if writer == "_save_policy" else run_module
-        monkeypatch.setattr(owner, writer, fail)
+        monkeypatch.setattr(run_module, writer, fail)
+    if writer == "save_policy":
+        agent = dataclasses.replace(toy_agent(), policy_builder=object())  # one that has a policy
+        monkeypatch.setitem(globals(), "toy_agent", lambda: agent)
     with pytest.raises(RunError, match="run cannot be written: .*No space left.*Make room") as told:
         train(run_dir)
     saved = bool(list_checkpoints(run_dir / "checkpoints"))

@@ -24,6 +24,7 @@ from torchrl_aca.training.files import write_text
 from torchrl_aca.training.resume import read_yaml
 
 FOLDER = Path(__file__).parents[1]
+PARTS = ("tasks", "methods")  # of a study, which may be run one by one
 
 Name = Annotated[str, Field(pattern=r"^[\w.+-]+$")]  # a part of a directory's name
 Overrides = dict[Name, list[str]]
@@ -182,29 +183,22 @@ def write_study(cfg: StudyConfig) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         with FileLock(path.with_name(".study.lock")):  # parts may be begun at the same time
             if path.exists():
-                found = _read_study(path)
-                if found.name != study.name:
-                    raise RunError(
-                        f"dir={path.parent} holds the study {found.name}; expected a new directory."
-                    )
-                for key in ("tasks", "methods"):  # a part of a study may be run on its own
-                    study[key] = {**found[key], **study[key]}
+                _add_earlier(study, path)
             write_text(path, OmegaConf.to_yaml(study))
     except OSError as error:
         raise RunError(f"dir={path.parent} cannot be used: {error}. Give another one.") from error
 
 
-def _has_sections(cfg: DictConfig, *names: str) -> bool:
-    return all(isinstance(cfg.get(name), DictConfig) for name in names)
-
-
-def _read_study(path: Path) -> DictConfig:
-    """What an earlier call has kept."""
+def _add_earlier(study: DictConfig, path: Path) -> None:
+    """Adds what an earlier call has kept: a part of a study may be run on its own."""
     path.read_bytes()  # where that fails, the file need not be damaged
-    found = read_yaml(path)
-    if found is None or "name" not in found or not _has_sections(found, "tasks", "methods"):
+    found = read_yaml(path) or OmegaConf.create()
+    if "name" not in found or not all(OmegaConf.is_dict(found.get(key)) for key in PARTS):
         raise RunError(
             f"{path} is damaged; expected name, tasks and methods of a study. Remove the file: the "
             "runs beside it stay, and this command writes it anew."
         )
-    return found
+    if found.name != study.name:
+        raise RunError(f"dir={path.parent} holds the study {found.name}; expected a new directory.")
+    for key in PARTS:
+        study[key] = {**found[key], **study[key]}

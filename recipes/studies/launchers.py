@@ -58,11 +58,7 @@ def run_local(settings: Local, jobs: Sequence[Job], threads: int, stop: StopSign
     """On this machine; a signal is passed on to the jobs, which save, a second Ctrl-C as well."""
     num_jobs = settings.jobs or max(1, _num_cores() // threads)
     with ThreadPoolExecutor(num_jobs) as pool:
-        try:
-            yield from _ended({pool.submit(run_job, job, threads, stop): job for job in jobs})
-        except KeyboardInterrupt:
-            stop.at_once = True
-            raise
+        yield from _ended({pool.submit(run_job, job, threads, stop): job for job in jobs})
 
 
 def _num_cores() -> int:

@@ -25,15 +25,14 @@ def replace_file(path: Path, write: Callable[[BinaryIO], object]) -> None:
     temporary = path.with_name(f"{path.name}.tmp")
     try:
         with open(temporary, "wb") as file:
-            try:
-                write(file)
-            except RuntimeError as error:  # torch's own of a full disk
-                raise OSError(f"{path}: {error}") from error
+            write(file)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
-    except BaseException:
+    except BaseException as error:
         temporary.unlink(missing_ok=True)
+        if isinstance(error, RuntimeError):  # torch's own of a full disk
+            raise OSError(f"{path}: {error}") from error
         raise
 
 

@@ -21,13 +21,12 @@ def say(message: str) -> None:
     A reader such as `head` or an interrupted `tee` may have gone, a disk may be full, and a signal
     may come in the middle of another line.
     """
-    try:
-        print(message, flush=True)
-    except BrokenPipeError:  # or Python fails again when it ends, and has another exit status
-        with suppress(*UNREADABLE), open(os.devnull, "w") as nowhere:
-            os.dup2(nowhere.fileno(), sys.stdout.fileno())
-    except UNREADABLE:
-        pass
+    with suppress(*UNREADABLE):
+        try:
+            print(message, flush=True)
+        except BrokenPipeError:  # or Python fails again when it ends, and has another exit status
+            with open(os.devnull, "w") as nowhere:
+                os.dup2(nowhere.fileno(), sys.stdout.fileno())
 
 
 def duration(seconds: float) -> str:

@@ -150,8 +150,9 @@ def _sections(cfg: DictConfig) -> set[str]:
 
 def _require_same_recipe(cfg: DictConfig, run: DictConfig, run_dir: Path) -> None:
     """Raises `RunError` where a recipe has keys, sections aside, that the run has not, or less."""
-    plain, made_with = (set(each) - _sections(each) for each in (cfg, run))
-    if other := sorted((plain ^ made_with) - {"existing"} - _sections(cfg) - _sections(run)):
+    # A key with a default has come later: runs of before it go on without.
+    later = {key for key, field in RunConfig.model_fields.items() if not field.is_required()}
+    if other := sorted((cfg.keys() ^ run.keys()) - later - _sections(cfg) - _sections(run)):
         raise RunError(
             f"{run_dir} is a run of another recipe, or of an earlier version of this one: only one "
             f"of the two has the key {other[0]}. Go on with the script that made it."

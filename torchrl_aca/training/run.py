@@ -247,8 +247,7 @@ class Run:
     def log_metrics(self) -> None:
         """Adds a row of training metrics, with the time and the speed."""
         values = {**self.collection.episodes.metrics(), **self.means.pop(), **self._speed()}
-        with self._writing():
-            self.logger.log("metrics", self._axes(), self.counters.total, values)
+        self._log("metrics", values)
         self.bar.show_metrics(self.counters.total, self.collection.frames, values)
 
     def log_evaluation(self) -> None:
@@ -256,14 +255,16 @@ class Run:
         self._signal.activity = "evaluation"
         values = self._evaluate(lambda step: self.bar.describe(f"evaluation, step {step}"))
         self._signal.activity = "iteration"
-        with self._writing():
-            self.logger.log("eval", self._axes(), self.counters.total, values)
+        self._log("eval", values)
         best = max(float(row["return_mean"]) for row in self.logger.tables["eval"].rows)
         self.bar.show_evaluation(self.counters.total, self.collection.frames, values, best)
         if self.cfg.checkpoint.keep_best and is_better(values["return_mean"], self._best):
             self._best = values["return_mean"]
-            with self._writing():
-                self._save_policy("best", {**self._axes(), **values})
+            self._save_policy("best", {**self._axes(), **values})
+
+    def _log(self, table: str, values: Metrics) -> None:
+        with self._writing():
+            self.logger.log(table, self._axes(), self.counters.total, values)
 
     def _speed(self) -> dict[str, float]:
         then, updates, frames = self._lap
@@ -280,8 +281,8 @@ class Run:
         """Writes a checkpoint of all parts."""
         directory, keep_last = self.dir / "checkpoints", self.cfg.checkpoint.keep_last
         updates = self.counters.total
+        self._save_policy(updates)  # first, so that no checkpoint is without one
         with self._writing():
-            self._save_policy(updates)  # first, so that no checkpoint is without one
             path = save_checkpoint(directory, self.parts, self.config, updates, keep_last)
         self._saved = (updates, self.collection.frames)
         return path
@@ -302,8 +303,9 @@ class Run:
         """Writes the policy for `load_policy`, if the agent tells how it is built."""
         agent, path = self.agent, policy_path(self.dir / "checkpoints", which)
         if agent.policy_builder is not None:
-            updates = self.counters.total
-            save_policy(path, agent.policy_builder, agent.policy, self.config, updates, evaluation)
+            made = self.config, self.counters.total, evaluation
+            with self._writing():
+                save_policy(path, agent.policy_builder, agent.policy, *made)
 
     def __exit__(
         self,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from types import FrameType
 from typing import Any
 
@@ -23,15 +23,9 @@ class StopSignal:
 
     Attributes:
         received: The signal's name, or None.
-        at_once: Whether commands that were told to stop are to end without saving.
+        at_once: Whether a second Ctrl-C came: commands that were told to stop end without saving.
         activity: What the run is in the middle of, for the answer to the user.
     """
-
-    # What a second one does: Python's and the system's own, not the handlers of before.
-    AT_ONCE: Mapping[signal.Signals, Any] = {
-        signal.SIGINT: signal.default_int_handler,
-        signal.SIGTERM: signal.SIG_DFL,
-    }
 
     def __init__(self, tell: Callable[[str], None] = say) -> None:
         """Does nothing until it is entered.
@@ -46,7 +40,8 @@ class StopSignal:
 
     def __enter__(self) -> StopSignal:
         """Installs the handlers."""
-        self._previous = {number: signal.signal(number, self._handle) for number in self.AT_ONCE}
+        numbers = (signal.SIGINT, signal.SIGTERM)
+        self._previous = {number: signal.signal(number, self._handle) for number in numbers}
         return self
 
     def __exit__(self, *exc_info: object) -> None:
@@ -59,9 +54,14 @@ class StopSignal:
             return
         self.received = signal.Signals(number).name
         time.sleep(TWINS)
-        for each, handler in self.AT_ONCE.items():
-            signal.signal(each, handler)
+        # A second one does what it does by itself, whatever the handlers of before.
+        signal.signal(signal.SIGINT, self._quit)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
         self._tell(f"{self.received}: stopping after this {self.activity}; Ctrl-C again quits")
+
+    def _quit(self, number: int, frame: FrameType | None) -> None:
+        self.at_once = True
+        signal.default_int_handler(number, frame)
 
 
 def run_command(command: Sequence[str], stop: StopSignal, **options: Any) -> int:
